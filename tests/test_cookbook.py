@@ -51,7 +51,7 @@ def test_a_recipe_is_a_page(page):
     assert len(page.read_text(encoding="utf-8").splitlines()) <= 60
 
 
-def test_what_was_not_said_is_noticed():
+def test_output_that_differs_from_a_page_is_noticed():
     said = "bad b\nview 4 is wrong, sigma 0.048 mm"
     match("view 4 is wrong, ... 0.049 mm", said, "a page")
     for expected in ("good b", "view 5 is wrong", "sigma 0.051 mm", "sigma 0.048 ... view 4"):

@@ -131,7 +131,7 @@ def test_commands_can_be_typed(page):
 
 
 @every_page
-def test_what_a_page_names_is_there(page):
+def test_names_on_a_page_exist(page):
     for name in spans_of(page):
         if re.fullmatch(r"visioncal(\.\w+)+", name):
             assert found(name), f"{page}: {name}"

@@ -338,7 +338,7 @@ def test_no_table_for_other_programs_carries_formulas(tmp_path, inputs):
 
 
 @pytest.mark.slow
-def test_what_a_tracker_measured_cannot_be_recovered_by_a_camera(tmp_path):
+def test_a_calibration_by_a_tracker_cannot_be_recovered_by_a_camera(tmp_path):
     visioncal("simulate", tmp_path / "s", "--instrument", "points").good()
     visioncal("calibrate", tmp_path / "s", "-o", tmp_path / "out", "--no-report").good()
     done = visioncal("recover", tmp_path / "act", "--against", tmp_path / "out")
@@ -353,7 +353,7 @@ def called(program, words, said, **more):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="stdin is closed as on POSIX")
-def test_what_comes_on_stdin_is_refused_by_the_line(program, inputs, tmp_path):
+def test_bad_lines_on_stdin_are_refused_one_by_one(program, inputs, tmp_path):
     words = ["guard", "--against", inputs / "pairs_out"]
     write_looks(tmp_path / "looks", inputs / "pairs")
     sound_look = (tmp_path / "looks").read_bytes().split(b"\n")[0]

@@ -83,7 +83,7 @@ def test_corners_under_glare_are_left_out(every):
 
 
 @pytest.mark.parametrize("name", ["charuco", "checkerboard", slow("aprilgrid"), "circles"])
-def test_sound_boards_have_none(name):
+def test_sound_boards_have_no_unsteady_corners(name):
     for seed in range(2):
         bow_m = 5e-4 * (seed % 2)
         found = on_board(simulate(CellOptions(target=BOARDS[name], seed=seed, board_bow_m=bow_m)))

@@ -291,7 +291,7 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
 
 
 @pytest.mark.slow
-def test_views_that_leave_lens_and_mount_open_are_told_of_both():
+def test_views_that_leave_lens_and_mount_open_are_reported_for_both():
     board, rng = CellOptions().target, np.random.default_rng(3)
     at_m = corner_positions(board) - corner_positions(board).mean(axis=0)
     seen, poses = [], []
@@ -310,7 +310,7 @@ def test_views_that_leave_lens_and_mount_open_are_told_of_both():
     assert "intrinsics: the views leave the focal length open" in second.words
 
 
-def test_stops_that_are_too_few_to_check_a_result_are_said_as_the_verdict_says_them(sound):
+def test_too_few_stops_to_check_a_result_are_reported_in_the_verdicts_words(sound):
     views = Session.load(sound).only(range(6))
     (found,) = visioncal.doctor(views).findings
     judged = visioncal.calibrate(views).verdict
@@ -359,7 +359,7 @@ def test_a_board_of_another_kind_is_named():
 @pytest.mark.parametrize(
     "name", [slow(name) if name in ("no turns", "one pose typed wrong") else name for name in NAMED]
 )
-def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
+def test_the_fault_is_named_first(tmp_path, monkeypatch, name):
     folder = broken(tmp_path / "session", name)
     found = visioncal.doctor(folder)
     assert found.findings[0].kind == NAMED[name]
@@ -401,7 +401,7 @@ def test_a_motion_that_determines_too_little_is_named_as_calibrate_names_it(moun
 
 
 @pytest.mark.parametrize("name", ["[cam] for [camera]", slow("images turned clockwise")])
-def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
+def test_an_unreadable_source_is_refused_with_the_command_to_type(tmp_path, name):
     folder = broken(tmp_path / "session", name)
     refused = command("doctor", folder)
     assert refused.status in (2, 3)

@@ -232,7 +232,7 @@ def test_a_robot_whose_poses_are_misread_is_named_first(three):
 
 
 @pytest.mark.slow
-def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
+def test_boards_that_look_alike_from_both_ends_are_distinguished_across_cameras():
     cell = simulate(
         replace(PLAIN, boards=tuple(replace(board, target=ALIKE) for board in PLAIN.boards))
     )
@@ -316,7 +316,7 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
 
 
 @pytest.mark.slow
-def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
+def test_an_instrument_without_common_readings_is_reported_with_a_way_to_tie_it():
     cell = simulate(NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=8))
     untied = solved(cell).cell.untied
     (remedy,) = {value.remedy for value in untied if value.frame == "instrument_t1"}
@@ -324,7 +324,7 @@ def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_
 
 
 @pytest.mark.slow
-def test_a_camera_and_a_board_that_see_each_other_alone_are_told_what_would_tie_them():
+def test_a_lone_camera_and_board_are_reported_with_a_way_to_tie_them():
     cell = simulate(replace(PLAIN, stops=8))
     kept = [one for one in cell.sights if (one.camera == "left") == (one.board == "floor")]
     untied = solved(replace(cell, sights=tuple(kept))).cell.untied
@@ -378,10 +378,10 @@ def test_a_robot_without_joints_stays_as_it_reports_itself():
     raised(DataError, "level 'all'", calibrate, bare, level="all")
 
 
-def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
+def test_an_untied_robot_is_refused_with_a_way_to_tie_it():
     cell = simulate(replace(PLAIN, boards=PLAIN.boards[:2], stops=8))
     caught = raised(DegenerateError, "nothing ties base_b to base_a", solved, cell)
-    assert "a camera see a board, one of both on base_b or on its robot" in caught.next_step
+    assert "a camera see a board, one of the two on base_b or on its robot" in caught.next_step
 
 
 @pytest.mark.slow
@@ -455,7 +455,7 @@ def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
 
 
 @pytest.mark.slow
-def test_noise_refuses_nothing():
+def test_noise_alone_refuses_no_cell():
     # Thirty times a usual camera's and robot's.
     found = calibrate(turned(35.0, noise=30.0)[1])
     assert found.verdict.status == "bad"
@@ -473,7 +473,7 @@ def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
     with pytest.raises(DegenerateError, match="differ in position only") as caught:
         calibrate(turned(0.0, stops=8, turn_deg=0.0)[1])
     assert caught.value.next_step == (
-        "To tie base_b: let a camera see a board, one of both on base_b or on its robot and the "
+        "To tie base_b: let a camera see a board, one of the two on base_b or on its robot, the "
         "other one tied, at 5 stops or more, tilted by 20 to 40 degrees about different axes."
     )
 

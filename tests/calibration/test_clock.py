@@ -112,7 +112,7 @@ def test_a_stated_offset_is_compared(session):
 
 
 @pytest.mark.slow
-def test_what_the_stream_does_not_cover_is_left_out_by_name(session):
+def test_views_that_the_stream_does_not_cover_are_left_out_by_name(session):
     def gapped(robot):
         s = robot.stamps_s
         return robot.values[((s < 3.0) | (s > 3.4)) & (s < 6.3)]
@@ -263,7 +263,7 @@ def test_a_clock_that_changes_is_named_and_taken_out(stamp, words):
     assert np.linalg.norm(away[:3, 3]) < 3e-4
 
 
-def test_the_offset_is_told_by_a_sweep():
+def test_the_offset_is_found_by_a_sweep():
     ahead_s = -0.61
     cell = swept(2, "eye-to-hand", replace(SHORT, camera_minus_robot_s=ahead_s))
     result = calibrate(cell_session(cell, "swept", seen="poses"))
@@ -390,7 +390,7 @@ def test_times_in_another_unit_and_times_that_are_missing_are_named(session):
 
 
 @pytest.mark.slow
-def test_what_is_open_about_the_clocks_counts(session):
+def test_uncertainty_of_the_clocks_counts(session):
     known, names = RunState(session), [stage.name for stage in STAGES]
     after = names.index("clock") + 1
     for stage in STAGES[:after]:

@@ -131,7 +131,7 @@ def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():
 
 
 @pytest.mark.slow
-def test_what_no_cure_was_applied_of_is_not_sure():
+def test_a_cause_without_a_tried_cure_is_not_certain():
     """No fit of an arm's links is possible without its joint angles."""
     cell = simulate(replace(FINE, dh_sigma_m=5e-4, dh_sigma_rad=1e-3))
     known = calibrated(cell, joints=False)
@@ -164,7 +164,7 @@ def test_a_camera_that_slowly_turns_is_no_lens_that_surely_changed(seed):
 
 
 @pytest.mark.slow
-def test_nothing_is_accused_of_more_than_it_can_do():
+def test_no_cause_explains_more_than_its_size_allows():
     """A base that creeps by 40 mm, and as is likelier, whatever else follows the order of views."""
     cell = simulate(FINE)
     time = np.linspace(-0.5, 0.5, len(cell.corners))[:, None]
@@ -182,7 +182,7 @@ def test_fewer_stops_than_check_a_result_accuse_no_arm():
 
 
 @pytest.mark.parametrize(("explains", "first"), [(0.9, "board_shape"), (0.3, "unexplained")])
-def test_what_the_fit_accounts_for_explains_what_it_removed(explains, first):
+def test_an_error_in_the_fit_explains_the_misfit_that_it_removed(explains, first):
     bent = Finding("board_shape", "The board is not flat.", explains=explains)
     verdict = judge(changed(SOUND, warnings=(bent,), noise_mm=1.0))
     assert verdict.causes[0].kind == first

@@ -31,7 +31,7 @@ def square_of(path, edge):
 
 
 @pytest.mark.slow
-def test_a_far_board_and_an_unknown_lens_are_told_apart_by_the_robots_motion(real_data):
+def test_a_far_board_and_an_unknown_lens_are_distinguished_by_the_robots_motion(real_data):
     # At 3 m the board is flat in its images, which tell no focal length.
     path = real_data / "field/worlds/far3m-h-4000"
     result = visioncal.calibrate(path)
@@ -130,7 +130,7 @@ def test_a_named_effect_on_a_lens_needs_no_second_entry(monkeypatch):
     assert off[1] < 0.1 * off[0]
 
 
-def test_what_a_held_lens_is_off_by_counts():
+def test_errors_of_a_held_lens_count():
     cell = simulate(CellOptions(views=22, seed=6))
     session = session_of(cell)
     camera = session.document["camera"]

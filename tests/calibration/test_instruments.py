@@ -209,7 +209,7 @@ def by_photographs(session):
         (PROBE, by_photographs, r"State sigma_rad in .instrument., or leave the columns"),
     ],
 )
-def test_what_cannot_be_calibrated_is_refused_by_name(options, change, words):
+def test_a_session_that_cannot_be_calibrated_is_refused_by_name(options, change, words):
     raised(DataError, words, known_of, change(session_of(tracked(options))))
 
 
@@ -267,7 +267,7 @@ def test_motion_that_tells_too_little_is_refused(change, words):
     shop = tracked(POINT, joints=change(tracked(POINT).joints))
     with pytest.raises(DegenerateError, match=words):
         known_of(session_of(shop, joints="one pose" not in words, poses="one pose" in words))
-    with pytest.raises(DataError, match="needs poses, and the instrument reads places alone"):
+    with pytest.raises(DataError, match="needs poses, and the instrument reads positions only"):
         known_of(session_of(tracked(POINT)), solver="tsai")
 
 
@@ -323,7 +323,7 @@ def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("beyond", [0.5, 1.0])
-def test_gears_of_two_slopes_are_told_under_heavy_loads(beyond, monkeypatch):
+def test_gears_of_two_slopes_are_found_under_heavy_loads(beyond, monkeypatch):
     """Shoulder and elbow yield half as much beyond a torque, or as much."""
     stiff, knees = np.array([1e6, 4.7e5, 3e5, 1e5, 1e5, 7e4]), {1: 900.0, 2: 500.0}
 

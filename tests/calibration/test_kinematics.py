@@ -135,7 +135,7 @@ def place_sigmas_m(known):
 
 
 @pytest.mark.slow
-def test_offsets_alone_are_told_from_wrong_links():
+def test_offsets_alone_are_distinguished_from_wrong_links():
     cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
     known = calibrated(cell)
     assert known.robot_arm.kinematics.level == "offsets"
@@ -148,7 +148,7 @@ def test_offsets_alone_are_told_from_wrong_links():
 
 
 @pytest.mark.slow
-def test_a_wrong_gear_ratio_is_told():
+def test_a_wrong_gear_ratio_is_reported():
     cell = simulate(replace(WRONG_LINKS, seed=2, views=40, branches=True))
     reported = cell.robot.joints.copy()
     reported[:, 1:4] *= 1.0 - 1e-3
@@ -371,7 +371,7 @@ def carrying():
 
 
 @pytest.mark.slow
-def test_springs_are_told_within_their_sigmas(carrying):
+def test_springs_are_found_within_their_sigmas(carrying):
     cell, known = carrying
     # Some disagree with the arm as stated, which does not bend; they come back.
     assert len(known.used) == len(cell.corners)
@@ -405,7 +405,7 @@ def test_the_calibrated_arm_stands_where_the_real_one_does_under_any_load(carryi
 
 
 @pytest.mark.slow
-def test_a_payload_that_is_not_as_stated_is_told(carrying):
+def test_a_payload_that_is_not_as_stated_is_reported(carrying):
     cell, known = carrying
     factor = arm_found(known).sections.elastic.payload_factor
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
@@ -456,7 +456,7 @@ def test_a_sagging_arm_of_unknown_weight_is_calibrated_with_its_sag():
 
 
 @pytest.mark.slow
-def test_play_is_told_by_stops_from_both_sides_and_is_no_stiffness():
+def test_play_is_found_by_stops_from_both_sides_and_is_no_stiffness():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     worn = calibrated(cell)
     assert worn.robot_arm.kinematics.level == "elastic"
@@ -522,7 +522,7 @@ def test_ranks_are_those_of_theory(name, mount):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
+def test_offsets_of_the_first_and_the_last_joint_are_never_determined(mount):
     robot = load_robot("ur5e")
     numbers, advice = identified(arm_data(robot, postures(robot)[:40], mount, ("offsets",)))
     counts = numbers.observability

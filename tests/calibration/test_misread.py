@@ -153,7 +153,7 @@ def test_a_long_recording_takes_no_more_memory_than_what_is_looked_at():
 
 
 @pytest.mark.parametrize(("side", "rows"), [("robot", 5), ("camera", 14)])
-def test_rotations_that_are_none_are_called_so(side, rows):
+def test_impossible_rotations_are_named(side, rows):
     poses = cell_poses()
     few = sound(poses.true_robot[:rows], poses.camera.poses()[:rows], poses.mount)
     wrong = getattr(few, side)
@@ -357,7 +357,7 @@ def test_sound_poses_are_not_accused(world, mount):
 
 
 @pytest.mark.slow
-def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatch):
+def test_the_advised_command_runs_as_printed_and_mends_the_session(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     planted = plant("the other mount", cell_poses())
     told, seen = planted.robot.poses(), planted.camera.poses()
@@ -405,7 +405,7 @@ def guessed_of(robot, seen) -> Guess:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3, 4])
-def test_another_size_that_leaves_most_of_a_misfit_is_none(seed):
+def test_another_size_that_leaves_most_of_a_misfit_is_no_cause(seed):
     """A tool longer by 150 mm in the later rows, from farther away, looks as a larger board."""
     rng, count = np.random.default_rng(seed), 22
     turns = np.column_stack([rng.normal(0.0, [0.25, 0.25, 0.6], (count, 3)), np.zeros((count, 3))])
@@ -424,7 +424,7 @@ def test_another_size_that_leaves_most_of_a_misfit_is_none(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])
-def test_what_was_never_recorded_is_named(lost):
+def test_poses_that_were_never_recorded_are_named(lost):
     poses = cell_poses()
     told = poses.robot.poses()
     if lost == "positions":
@@ -711,7 +711,7 @@ def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
 
 
 @pytest.mark.parametrize("moved", [(*POSE, *JOINTS), POSE], ids=["both", "poses alone"])
-def test_what_is_of_one_log_changes_rows_together(cell, tmp_path, moved):
+def test_columns_of_one_log_change_rows_together(cell, tmp_path, moved):
     views = Session.load(cell).views
     later = [*views[1:], views[0]]
     rewritten(cell, lambda at, row: row | {name: later[at].cell(name) for name in moved})
@@ -815,7 +815,7 @@ def test_distances_that_are_several_times_too_long_are_mended_by_the_printed_com
     assert np.linalg.norm(x[:3, 3] - true[:3, 3]) < 1.5e-3
 
 
-def test_of_rivals_of_a_symmetric_board_those_turn_as_the_robot_does():
+def test_rivals_of_a_symmetric_board_turn_as_the_robot_does():
     poses, half = cell_poses(views=14), np.diag([-1.0, -1.0, 1.0])
     seen = poses.camera.poses()[:, None, :3, :3]
     rivals = np.concatenate([seen, seen @ half], axis=1)

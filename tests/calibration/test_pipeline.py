@@ -107,7 +107,7 @@ def test_views_held_back_may_be_ambiguous():
     assert known.findings.pairs[0].holdout.mm < 5 * known.findings.held_out.mm
 
 
-def test_a_session_that_holds_all_views_back_is_told_so():
+def test_a_session_that_holds_all_views_back_is_refused():
     for given in (True, False):
         cell = simulate(replace(FINE, views=8, state_intrinsics=given))
         told = session_of(cell)
@@ -428,7 +428,7 @@ def test_boards_have_names_and_a_common_covariance_that_holds():
 
 
 @pytest.mark.slow
-def test_one_view_places_a_board_and_none_is_told():
+def test_one_view_places_a_board_and_a_board_without_views_is_reported():
     cell = simulate(replace(TWO, second=replace(Second(), target=BOARDS["charuco"]), seed=6))
     first, further = (np.flatnonzero(board_numbers(cell) == board) for board in (0, 1))
     known = calibrated(without(cell, {*further[1:]}))
@@ -467,7 +467,7 @@ def test_every_output_shows_all_boards(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_written_of_the_fit_is_read_back():
+def test_sections_of_the_fit_are_read_back_as_written():
     """Further boards are written relative to the first."""
     wrong = replace(TWO, seed=2, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
     known = calibrated(simulate(wrong))
@@ -509,7 +509,7 @@ def run_with(cell: SimulatedCell, prior: dict[str, dict[str, float]]) -> RunStat
     return calibrated(cell, session=session, level="hand-eye")
 
 
-def test_what_cannot_be_used_is_said():
+def test_rows_that_cannot_be_used_are_named():
     prior = {"z_m": 0.1, "sigma_m": SIGMA_M}
     other = calibrate(scara(5, {"base_from_cam": prior}, 14, tilted=8)).verdict
     words = (

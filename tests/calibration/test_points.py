@@ -171,7 +171,7 @@ def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size():
 
 
 @pytest.mark.slow
-def test_sigmas_weigh_the_corners_and_the_camera_is_where_it_is_within_its_own():
+def test_sigmas_weigh_the_corners_and_the_camera_is_within_its_sigma():
     squares, variances = 0.0, {None: 0.0, 1.0: 0.0}
     for seed in range(2):
         for stated in variances:
@@ -620,7 +620,7 @@ def test_files_lie_beside_what_names_them(folder, tmp_path, monkeypatch):
     raised(DataError, "more than 2 rows", corners.parse_corners, text)
 
 
-def test_what_was_measured_counts_in_the_digest_and_a_deleted_row_takes_its_corners(folder):
+def test_measurements_count_in_the_digest_and_a_deleted_row_takes_its_corners(folder):
     digest, text = Session.load(folder).digest(), (folder / "corners.csv").read_text()
     rig = (folder / "target.points.csv").read_text()
     for name, whole in (("corners.csv", text), ("target.points.csv", rig)):

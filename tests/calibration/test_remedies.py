@@ -194,7 +194,7 @@ QUICK = ("poses read on the way",)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in FAULTS])
-def test_what_is_named_is_mended_by_what_is_printed(tmp_path, monkeypatch, name):
+def test_a_named_fault_is_mended_by_the_printed_command(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     fault = FAULTS[name]
     cell = fault.seen(simulate(fault.options))

@@ -127,7 +127,7 @@ def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
     assert 0.4 < np.sqrt(np.mean((left / sigma) ** 2)) < 1.8
 
 
-def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
+def test_an_undetermined_coefficient_stays_at_its_prior_and_is_named(learnt):
     thermal = learnt("temperatures").calibration.thermal
     # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
     assert "growth of wrist_3_joint" in thermal.not_determined
@@ -137,7 +137,7 @@ def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
 
 
 @pytest.mark.slow
-def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
+def test_uncertainty_of_the_drift_counts_in_the_edges_covariance(learnt):
     known, truth = learnt("currents").calibration, learnt("currents").truth.transforms
     away = [log(invert(true) @ known.edges[name].matrix) for name, true in truth.items()]
     error = np.concatenate(away)
@@ -233,7 +233,7 @@ def test_the_calibration_tells_the_arm_at_any_temperature(learnt, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["temperatures", "currents"])
-def test_the_flange_moves_with_the_parameters_as_it_is_told(kind):
+def test_derivatives_of_the_flange_by_the_parameters_are_right(kind):
     heat, at_s = inputs(kind), np.linspace(100.0, 7000.0, 7)
     before = model(kind)
     links = before.heating.links_c(heat, at_s)

@@ -872,7 +872,7 @@ def test_rows_exchanged_among_stops_that_are_alike_have_one_partner_each():
     assert (np.sort(pairs % count, axis=1) == [2, 7]).all()
 
 
-def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
+def test_views_of_a_symmetric_board_that_are_read_turned_are_named_and_turned_back(
     tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)

@@ -116,7 +116,7 @@ def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
     assert sum(cause.probability for cause in verdict.causes) == pytest.approx(1.0)
 
 
-def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
+def test_an_error_that_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     """However sure it is that it is there."""
     found = changed(SOUND, warnings=(FIELD, SIZE), noise_mm=1.0)
     verdict = judge(found)
@@ -163,7 +163,7 @@ def test_errors_of_an_arm_are_as_likely_as_what_another_cure_leaves() -> None:
         ("apriltag_36h11_id0_120mm", "a side of 120.6 mm, not of 120 mm"),
     ],
 )
-def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said) -> None:
+def test_another_size_is_reported_under_the_key_of_the_targets_file(name, said) -> None:
     found = scale_finding("board", load_target(name), MEASURED, MEASURED, "left")
     assert said in found.words
     assert "--board-scale left:1.0047 " in found.do.command
@@ -329,7 +329,7 @@ def session_of(cell: SimulatedCell, base_from_flange: np.ndarray) -> Session:
     )
 
 
-def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> None:
+def test_poses_of_another_instant_than_the_joints_are_found_by_the_images() -> None:
     cell = simulate(CellOptions(views=20, robot_sigma_m=5e-5, robot_sigma_rad=5e-5))
     late = exp(np.random.default_rng(2).normal(size=(20, 6)) * np.repeat([1e-3, 6e-4], 3))
     flanges = cell.robot.base_from_flange @ late
@@ -343,7 +343,9 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_images_that_are_shifted_from_some_view_on_are_told_from_a_camera_that_moved(mount) -> None:
+def test_images_that_are_shifted_from_some_view_on_are_distinguished_from_a_camera_that_moved(
+    mount,
+) -> None:
     cell = simulate(CellOptions(views=24, mount=mount, pixel_sigma_px=0.1, seed=2))
     shifts = np.where(np.arange(24)[:, None] < 10, 0.0, [24.0, -16.0])
     corners = [replace(at, px=at.px + by) for at, by in zip(cell.corners, shifts, strict=True)]
@@ -468,7 +470,7 @@ def test_a_step_by_a_few_times_the_noise_is_named_though_a_view_agrees_by_chance
 
 
 @pytest.mark.slow
-def test_a_row_that_was_not_filled_in_is_said_to_be() -> None:
+def test_a_row_that_was_not_filled_in_is_reported() -> None:
     cell = simulate(CellOptions(views=20))
     flange = cell.robot.base_from_flange.copy()
     flange[7] = np.eye(4)
@@ -948,7 +950,7 @@ def test_picks_err_as_the_chain_does() -> None:
 
 
 @pytest.mark.slow
-def test_what_an_arm_does_again_moves_no_pick() -> None:
+def test_an_error_that_an_arm_repeats_moves_no_pick() -> None:
     """Its base and its flange are off by 2 mm and 4 mrad: the frames have taken it up."""
     known = without_arm_errors(calibrated(simulate(CellOptions()), joints=False))
     answer, solved = known.assessment, known.cell_fit
@@ -971,7 +973,7 @@ def test_what_an_arm_does_again_moves_no_pick() -> None:
 
 
 @pytest.mark.slow
-def test_what_happens_now_and_then_happens_at_picks() -> None:
+def test_an_occasional_error_happens_at_picks_too() -> None:
     cell, rng = simulate(CellOptions(views=25)), np.random.default_rng(1)
     poses, away = cell.robot.base_from_flange.copy(), np.zeros((25, 6))
     # At four stops the flange is 0.6 mm off, which is twice as much as is needed.
@@ -989,7 +991,7 @@ def test_what_happens_now_and_then_happens_at_picks() -> None:
 
 
 @pytest.mark.slow
-def test_what_happens_from_image_to_image_happens_at_picks() -> None:
+def test_an_error_that_differs_by_image_happens_at_picks_too() -> None:
     # A focus of 0.2 %, which shows a thing that much nearer or farther.
     cell, rng, share = simulate(CellOptions()), np.random.default_rng(3), 2e-3
     centre = cell.options.camera.matrix[2:]
@@ -1116,7 +1118,7 @@ def test_noise_that_a_finding_explains_asks_no_more_of_a_need_than_the_finding()
     assert "whatever is behind the doubts; if mere noise is, of 0.28 mm" in judge(found).reasons[-1]
 
 
-def test_what_inflates_all_sigmas_is_said_beside_the_accuracy() -> None:
+def test_a_cause_that_inflates_all_sigmas_is_named_with_the_accuracy() -> None:
     length = Finding("arm_parameter", "A length is 4 mm longer.", until_mm=0.0)
     verdict = judge(replace(SOUND, picks=(of_size(4.0),), warnings=(length,)))
     (words,) = (at.words for at in verdict.findings if at.kind == "good_for")

@@ -682,7 +682,7 @@ ALIKE = {
 
 
 @pytest.mark.parametrize("name", [slow(name) if name in ALIKE else name for name in WORLDS])
-def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
+def test_the_error_of_a_world_is_named_and_its_sigmas_hold(name):
     world = WORLDS[name]
     cell = world.change(simulate(replace(world.options, seed=world.seed)))
     known = calibrated(cell, joints=world.joints)
@@ -728,7 +728,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
         (onwards, "moves_on", None),
     ],
 )
-def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):
+def test_an_error_that_grows_is_named_recovered_and_in_the_budget(change, kind, true):
     """With reach, time, or gravity; of time, from the end, at which it is zero."""
     cell = change(simulate(replace(FINE, views=30)))
     known = calibrated(cell, joints=False)

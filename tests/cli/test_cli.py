@@ -161,7 +161,7 @@ def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
     assert len(DataError("\n".join(["y" * 9000] * 10)).message) < 3200
 
 
-def test_what_stands_in_the_way_is_named(pairs, tmp_path, monkeypatch):
+def test_files_in_the_way_are_named(pairs, tmp_path, monkeypatch):
     (tmp_path / "recording.rrd").touch()
     (tmp_path / "taken").write_text("a file where the folder should be")
     # Nothing is rendered for a folder that is not empty.
@@ -219,7 +219,7 @@ MISSING = {
     "diff one": "SECOND is missing",
     "plan ur10e --camera 900,900,640,400": "--target, --cam, --board, --resolution are needed",
     "fixture": "visioncal fixture TOUCHES -c OUT --cad DRAWING --tool NAME",
-    "fixture cell/points.csv": "tool that touched the points is not said, nor which points they",
+    "fixture cell/points.csv": "tool that touched the points is not stated, nor which points they",
     "record -o new": "--target, --arm and --camera are missing",
     "record -o new --arm manual": "--target and --camera are missing",
     "record -o new --camera folder:x": "Name them, as --target charuco_9x6_30mm --arm manual; ",
@@ -254,7 +254,7 @@ def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
     assert set(truth.transforms) == {"base_from_cam", "flange_from_target"}
 
 
-def test_steps_are_said_in_words_and_without_a_terminal_in_lines(monkeypatch):
+def test_steps_are_shown_in_words_and_without_a_terminal_in_lines(monkeypatch):
     steps, said, err = progress.Steps(), [], io.StringIO()
     for report in (("detect", 2, 10), ("detect", 1, 40), ("detect", 40, 40), ("solve", 7, 10)):
         steps.report(*report)
@@ -396,7 +396,7 @@ def test_files_and_columns_that_are_missing_are_named_at_once(tmp_path):
     begun.refused(f"visioncal history visioncal-history.db --add {out}")
 
 
-def test_what_is_no_session_yet_is_told_how_to_become_one(rendered, tmp_path):
+def test_a_folder_that_is_no_session_yet_is_refused_with_the_way_to_one(rendered, tmp_path):
     pictures, table = tmp_path / "pictures", tmp_path / "log.csv"
     shutil.copytree(rendered / "images", pictures)
     table.write_text("X,Y,Z,W,P,R\n1,2,3,4,5,6\n")
@@ -497,7 +497,7 @@ def test_a_short_command_loads_what_it_uses(words, most, used, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_said_is_of_use_where_it_is_said(rendered, pairs, tmp_path, monkeypatch):
+def test_messages_are_of_use_in_their_place(rendered, pairs, tmp_path, monkeypatch):
     """Coverage, verdicts beside exports, what could not be checked, and guards without looks."""
     out = tmp_path / "out"
     said = visioncal("calibrate", rendered, "-o", out, "--no-recording").out
@@ -527,7 +527,7 @@ def test_what_is_said_is_of_use_where_it_is_said(rendered, pairs, tmp_path, monk
     assert "could not be checked: the ambient temperature" in said
     assert "payload" not in said.partition("could not be checked")[2]
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
-    visioncal("guard", *against).refused("no look came on stdin", "guard --example")
+    visioncal("guard", *against).refused("stdin held no look", "guard --example")
 
 
 @pytest.mark.slow
@@ -653,7 +653,7 @@ def test_broken_streams_take_no_result_away(pairs, tmp_path, out, err, options, 
 
 
 @HAS_FULL
-def test_every_command_ends_so():
+def test_every_command_ends_with_one_message_where_stdout_is_full_or_closed():
     for arguments in (["--help"], ["--version"], ["calibrate", "none", "--json"]):
         err = io.StringIO()
         with full() as out:
@@ -684,7 +684,7 @@ READERS = """
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "pipe.rrd", "pipe.json"])
-def test_what_cannot_be_read_is_no_bug_and_is_not_waited_for(name, tmp_path, monkeypatch):
+def test_an_unreadable_source_is_no_bug_and_is_not_waited_for(name, tmp_path, monkeypatch):
     """Names that no file has, and files that might never end, at every command that reads."""
     monkeypatch.chdir(tmp_path)
     if name.startswith("pipe"):

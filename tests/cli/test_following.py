@@ -57,7 +57,7 @@ def told(*messages, status=2):
         (tuple(f"In session.toml, write at = {at}." for at in range(1, 12)), "does not end"),
     ],
 )
-def test_what_cannot_be_followed_is_noticed(place, messages, why):
+def test_a_step_that_cannot_be_followed_is_noticed(place, messages, why):
     cell = place / "cell"
     cell.mkdir()
     (cell / "session.toml").write_text('name = "cell"\ntarget = "charuco_9x6_30mm"\n')
@@ -188,7 +188,7 @@ def test_one_of_several_boards_is_scaled_by_its_name(place):
     assert sizes == pytest.approx([0.03, 1.01 * 0.032])
 
 
-def test_a_size_that_poses_gave_is_known_no_better_than_so(place):
+def test_a_size_by_poses_is_known_no_better_than_the_poses(place):
     options = CellOptions(views=16, seed=3, board_scale=0.6, pixel_sigma_px=0.05)
     cell_session(simulate(options), "cell", seen="corners").save(place / "cell")
     guessed = visioncal("convert", "cell", "guessed", "--guess", "--yes")
@@ -357,7 +357,7 @@ QUICK = (
 @pytest.mark.parametrize(
     "name", [name if name.startswith(QUICK) else slow(name) for name in DONE_WRONG]
 )
-def test_what_is_done_wrong_ends_in_a_result_or_in_words(place, name):
+def test_a_user_s_mistake_ends_in_a_result_or_in_a_message(place, name):
     plant, words, status, said = DONE_WRONG[name]
     plant(sound_session(place / "cell"))
     followed = follow(*words)

@@ -98,7 +98,7 @@ def test_the_maker_is_kept_from_the_table_to_the_export(cell, maker, tmp_path):
     assert np.abs(readers.READERS[maker](exported) - camera).max() < 1e-9
 
 
-def test_a_recording_keeps_it_and_digests_do_not_depend_on_it(cell, tmp_path):
+def test_a_recording_keeps_the_form_and_digests_do_not_depend_on_it(cell, tmp_path):
     session, recording = converted(cell, "fanuc", tmp_path), tmp_path / "session.rrd"
     visioncal("convert", session, recording).good()
     visioncal("convert", recording, tmp_path / "back").good()
@@ -211,7 +211,7 @@ def test_a_form_that_is_not_known_is_refused(cell, tmp_path, form, words):
     visioncal("calibrate", tmp_path / "cell", "-o", tmp_path / "out").refused(*words)
 
 
-def test_what_is_stated_goes_before_the_name_of_the_model():
+def test_a_stated_form_precedes_that_of_the_model():
     assert controller_form("kuka_kr6").name == "kuka"
     assert controller_form("ur10e", "kuka").name == "kuka"
     assert controller_form("somebody") is None
@@ -346,7 +346,9 @@ def tool(work):
 
 
 @pytest.mark.parametrize("maker", FEW)
-def test_touches_are_read_and_frames_are_told_in_the_robot_s_form(of_maker, tool, maker, tmp_path):
+def test_touches_are_read_and_frames_are_printed_in_the_robot_s_form(
+    of_maker, tool, maker, tmp_path
+):
     rng = np.random.default_rng(2)
     poses = turned_poses(rng, PIVOT, TIP, np.eye(3))
     drawn = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0.15, 0], [0, 0.15, 0], [0.1, 0.1, 0.05]])
@@ -376,7 +378,7 @@ def test_touches_are_read_and_frames_are_told_in_the_robot_s_form(of_maker, tool
 
 
 @pytest.mark.slow
-def test_touches_of_another_maker_are_refused_until_it_is_said(of_maker, tmp_path):
+def test_touches_of_another_maker_are_refused_until_the_maker_is_stated(of_maker, tmp_path):
     poses = turned_poses(
         np.random.default_rng(2), np.tile([0.5, -0.1, 0.2], (8, 1)), np.ones(3) / 10, np.eye(3)
     )

@@ -58,7 +58,7 @@ def test_yaml_values(text, value):
         ("a: 1\nb: !!python/object/apply:os.getcwd []", "line 2: the tag 'python/object/apply"),
         ("a: !!python/name:os.system x", "the tag"),
         ("a: !local x", "the tag"),
-        ("a: 1\nb: 2\na: 3", "line 3: 'a' must be a key, a word that is there once"),
+        ("a: 1\nb: 2\na: 3", "line 3: 'a' must be a key that occurs once"),
         ("a: &a [*a]", "not YAML"),
         ("[" * 200, "not YAML"),
         ("[" * 100_000, "not YAML"),
@@ -108,7 +108,7 @@ def test_pairs_of_utf_16_in_json_are_letters():
     assert parse_json('["\\uD83D\\ude00"]', "it") == ["\N{GRINNING FACE}"]
 
 
-def test_json_numbers_that_are_none():
+def test_json_numbers_that_are_not_finite_are_read():
     value = parse_json("[NaN, -Infinity, 1e999, %s, null]" % ("7" * 5000), "it")
     assert math.isnan(value[0])
     assert value[1:4] == [-math.inf, math.inf, math.inf]
@@ -135,7 +135,7 @@ def test_xml_has_no_document_type(file):
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
-def test_what_opencv_writes_is_read_without_it(tmp_path, suffix):
+def test_files_of_opencv_are_read_without_it(tmp_path, suffix):
     path = tmp_path / f"stored.{suffix}"
     # OpenCV's JSON has no notation of its own for what is not finite.
     odd = [1.0, 2.0] if suffix == "json" else [np.inf, np.nan]
@@ -155,7 +155,7 @@ def test_what_opencv_writes_is_read_without_it(tmp_path, suffix):
 
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("dtype", ["<f8", ">f4", "<i2", "|u1", "|b1", "<U5", "|S3"])
-def test_what_numpy_writes_is_read_without_it(tmp_path, dtype, order):
+def test_files_of_numpy_are_read_without_it(tmp_path, dtype, order):
     array = np.asarray(np.arange(6).reshape(2, 3) % 2, dtype=dtype, order=order)
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", array=array, scalar=array[0, 0])
@@ -341,12 +341,12 @@ def test_only_line_ends_end_a_row(file):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('{"rows": [{"value": 1e300}]}', r"value is 1e\+300, but must be a number that a cell has"),
-        ('{"value": NaN}', "a number that a cell has"),
+        ('{"rows": [{"value": 1e300}]}', r"value is 1e\+300, but must be at most"),
+        ('{"value": NaN}', "must be at most"),
         ("[]", "must be a table"),
         ("[" * 100000, "nested deeper"),
-        ('{"schema": ' + "9" * 6000 + "}", "a number that a cell has"),
+        ('{"schema": ' + "9" * 6000 + "}", "must be at most"),
     ],
 )
-def test_what_we_wrote_ourselves_has_numbers_of_a_cell(text, words):
+def test_stored_documents_must_have_numbers_of_a_cell(text, words):
     raised(DataError, words, parse_stored, text, "a.json")

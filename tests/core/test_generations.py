@@ -62,7 +62,7 @@ def test_on_windows_files_are_renamed_one_by_one(tmp_path, monkeypatch):
 
 
 @posix
-def test_what_a_living_writer_has_aside_is_left_alone(tmp_path):
+def test_temporary_files_of_a_living_writer_are_left_alone(tmp_path):
     def write(aside):
         # Another one comes and goes meanwhile.
         written(tmp_path, LESS)
@@ -206,7 +206,7 @@ def test_missing_file_and_folder_are_named(tmp_path):
     raised(DataError, "cannot be written", write_atomically, tmp_path / "missing" / "a.txt", "")
 
 
-def test_what_might_never_end_is_not_read(tmp_path):
+def test_files_that_may_never_end_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     for path in (tmp_path / "pipe.csv", Path("/dev/zero")):
         raised(DataError, "is not a regular file", read_bytes, path)

@@ -180,6 +180,6 @@ def test_a_sigma_beyond_all_cells_is_called_not_determined():
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(-2, []), (0, []), (1, [0]), (5, [0, 2, 4])])
-def test_numbers_are_chosen_evenly_and_none_of_nothing(count, chosen):
+def test_numbers_are_chosen_evenly_and_none_of_an_empty_range(count, chosen):
     # A robot that never moved has one stop, and a change needs two on either side of it.
     assert evenly(count, 3).tolist() == chosen

@@ -169,7 +169,7 @@ def test_torques_are_fed_forward(world, run):
     assert np.sqrt(np.mean(before[:, 1] ** 2)) > 10.0 * np.sqrt(np.mean(away[:, 1] ** 2))
 
 
-def test_what_a_result_is_doubted_for_is_named(run):
+def test_the_doubt_about_a_result_is_named(run):
     """But for the first: a lag that is a small share of the torques is a remark."""
     known, checked = run.identified, run.identified.validation
     assert judge(known).status == "good"
@@ -228,7 +228,7 @@ def test_a_payload_is_weighed(world, run):
     assert more == pytest.approx(-held, abs=1e-9)
 
 
-def test_what_the_drives_gains_are_known_to_counts_in_the_mass(run, world):
+def test_sigmas_of_the_drives_gains_count_in_the_mass(run, world):
     """All drives of one sign, as lists have it: the mass is as wrong as the gains."""
     streams = loaded_streams(run.identified, world.full)
     exact = estimate_payload(run.identified, streams)
@@ -242,7 +242,7 @@ def test_what_the_drives_gains_are_known_to_counts_in_the_mass(run, world):
     assert found.document()["gains_sigma_kg"] == found.gains_sigma_kg
 
 
-def test_no_payload_is_none(world, run):
+def test_a_recording_without_payload_is_refused(world, run):
     same = exercise_session("ur10e", {"again": world.empty.streams["check"]})
     with pytest.raises(DegenerateError, match="does not differ from none"):
         estimate_payload(run.identified, loaded_streams(run.identified, same))

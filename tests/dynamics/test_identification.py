@@ -108,7 +108,7 @@ def test_encoders_may_be_eccentric():
     ("name", "inertial", "all_of_it"),
     [("ur5e", 36, 54), ("ur10e", 36, 54), ("panda", 43, 64), ("irb120", 36, 54)],
 )
-def test_so_many_parameters_can_be_told(name, inertial, all_of_it):
+def test_the_number_of_identifiable_parameters_is_right(name, inertial, all_of_it):
     robot = load_robot(name)
     assert BaseModel.reduce(DynamicModel(robot, NO_FRICTION)).rank == inertial
     for seed in range(3):
@@ -177,7 +177,7 @@ def urdf_of(robot):
     return {"schema": 1, "name": robot.name, "tip": robot.tip, "urdf": small_urdf(robot)}
 
 
-def test_what_an_arm_weighs_is_no_fact_of_a_recording():
+def test_an_arms_mass_is_no_fact_of_a_recording():
     """A session's digest stays what it was before its robot's table told inertias and drives."""
     told = read_robot_document("panda")
     # The table as it was, in its own words.
@@ -256,7 +256,7 @@ def test_each_joint_gets_the_weight_of_its_noise():
     assert np.sum((only.used * left / sigma) ** 2) == pytest.approx(4000.0, rel=0.06)
 
 
-def test_blocks_have_noise_of_their_own():
+def test_each_block_has_its_noise():
     quiet, loud = block(2, 1000), block(3, 1000)
     loud = replace(loud, y=loud.x @ TRUE + 10.0 * (loud.y - loud.x @ TRUE))
     fit = regress([quiet, loud])
@@ -276,7 +276,7 @@ def test_outliers_are_left_out():
     assert chi2(fit) < 16.3  # chance exceeds it once in a thousand
 
 
-def test_unused_rows_count_for_nothing():
+def test_unused_rows_do_not_count():
     whole = block(5)
     used = whole.used.copy()
     used[200:] = False
@@ -372,7 +372,7 @@ def test_breaking_loose_is_found():
 
 
 @pytest.mark.slow
-def test_an_arm_without_humps_gets_none(worlds):
+def test_an_arm_without_humps_gets_no_humps(worlds):
     built, _, _, _ = worlds[0]
     rng = np.random.default_rng(7)
     streams = [recorded(built, exercise(6, rng), rng) for exercise in (multi_sine, slow_sweep)]
@@ -544,7 +544,7 @@ def test_saturated_torques_are_named_and_left_out(stream):
     assert in_thousandths.used.all()
 
 
-def test_speeds_that_are_none_of_the_angles_are_left_out(stream):
+def test_speeds_that_contradict_the_angles_are_left_out(stream):
 
     def degrees(columns):
         for joint in range(1, 7):
@@ -715,13 +715,13 @@ def test_lags_are_found_to_their_sigmas(lag_s, whole):
     assert np.abs(away).max() < 4.5
 
 
-def test_torques_in_time_have_none():
+def test_synchronous_torques_have_no_lag():
     rng = np.random.default_rng(4)
     built = real_dynamics("ur5e", rng, stribeck=True)
     assert lag_of(record(built, multi_sine(6, rng), rng)) is None
 
 
-def test_what_no_lag_mends_has_none():
+def test_torques_that_no_lag_explains_have_no_lag():
     rng = np.random.default_rng(5)
     stream = late(record(real_dynamics("ur5e", rng), multi_sine(6, rng), rng), 0.08)
     turned = [column for column in stream.columns if column.startswith("tau")]

@@ -403,7 +403,7 @@ def test_tables_of_an_earlier_plan_are_taken_away(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_what_cannot_be_checked_is_said(tmp_path):
+def test_checks_that_are_impossible_are_named(tmp_path):
     document = small_document(inertia_kg_m2=None)
     path = tmp_path / "light.toml"
     path.write_text(tomli_w.dumps(document))

@@ -178,7 +178,7 @@ def test_the_likeliest_size_of_more_unknowns_is_that_of_the_likelihood(true_size
         assert size < 0.5
 
 
-def test_a_size_of_nothing_is_found_beside_a_large_one():
+def test_a_size_of_zero_is_found_beside_a_large_one():
     """Only the first coordinate errs: what both have of their own is lost in the rounding."""
     common = np.random.default_rng(2).normal(0.0, 1.0, (40, 1))
     parts = np.zeros((2, 40, 2, 2))
@@ -219,7 +219,7 @@ def test_a_field_of_size_one_has_it_all_over_the_image():
 
 
 @pytest.mark.slow
-def test_what_is_eliminated_is_noise_that_corners_share(corners):
+def test_eliminated_unknowns_are_noise_that_corners_share(corners):
     """The Schur complement of the whole problem by a dense covariance, as generalised squares."""
     problem, looks = corners
     stack, poses = problem.stack, looks.poses
@@ -452,7 +452,7 @@ def test_weights_of_views_are_what_noise_asks_for():
         assert weights_by_view(np.array(squares, float), np.array(of, float)) is None
 
 
-def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
+def test_the_sigma_of_the_size_of_an_arms_errors_is_right():
     rng = np.random.default_rng(0)
     problem = observed_world(world(rng, stops=8), rng)
     # Six errors, of which four are told.

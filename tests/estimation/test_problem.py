@@ -351,7 +351,7 @@ def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_a_board_that_was_turned_over_is_told_exactly(mount):
+def test_a_board_that_was_turned_over_is_found_exactly(mount):
     rng = np.random.default_rng(4)
     data, state = stops_of(mount, rng)
     change = np.array([0.0, 2.9, 0.3, 0.2, -0.1, 0.4])
@@ -484,7 +484,7 @@ def sampled(hz: float, keep=lambda times_s: times_s >= 0.0) -> Trajectory:
     return Trajectory(times_s, swung(times_s))
 
 
-def test_nothing_is_said_across_gaps_and_beyond_the_ends() -> None:
+def test_a_trajectory_covers_neither_gaps_nor_times_beyond_its_ends() -> None:
     moved = sampled(100, lambda value: (value < 2.0) | (value > 2.5))
     at_s = np.array([-0.01, 0.0, 1.985, 2.2, 2.505, 9.985, 9.995])
     assert moved.covers(at_s).tolist() == [False, True, True, False, False, True, False]
@@ -637,7 +637,7 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     assert found == pytest.approx(values, abs=1e-5)
 
 
-def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
+def test_distant_views_are_left_out_where_the_others_agree_poorly():
     """Poses to 10 mm and 1 deg, which is more than any result may be off, and one to 100 deg."""
     cell, rng = simulate(replace(FINE, views=60, seed=4)), np.random.default_rng(0)
     noise = np.repeat([np.deg2rad(1.0), 0.01], 3) * rng.standard_normal((60, 6))

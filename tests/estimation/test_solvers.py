@@ -304,7 +304,7 @@ def assert_rigid(found: HandEye) -> None:
 
 
 @pytest.mark.parametrize("rise_m", [0.0, 0.1])
-def test_what_the_robot_moves_by_determines_the_turn_about_a_lone_axis(rise_m: float):
+def test_positions_of_the_robot_determine_the_turn_about_a_lone_axis(rise_m: float):
     for seed in range(5):
         rng = np.random.default_rng(seed)
         angles, moves = rng.uniform(-2.5, 2.5, 8), rng.uniform(-0.15, 0.15, (8, 3))
@@ -345,7 +345,7 @@ def test_poor_motion_gives_a_finite_transform(solver: Solver, build: Build):
 
 
 @all_solvers
-def test_what_motion_leaves_open_is_zero(solver: Solver):
+def test_components_that_motion_does_not_determine_are_zero(solver: Solver):
     for seed in range(10):
         problem, axis = one_axis(np.random.default_rng(seed))
         noisy = shaken(problem, np.random.default_rng(seed))

@@ -102,7 +102,7 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
     ],
 )
 @pytest.mark.parametrize("draws", seeds(1, 4))
-def test_what_moves_is_opened_and_its_result_is_fair(kind, size, draws):
+def test_a_frame_that_moves_is_opened_and_its_result_is_fair(kind, size, draws):
     squares, found = [], 0
     for seed in draws:
         small = moving(kind, seed, size)
@@ -117,7 +117,7 @@ def test_what_moves_is_opened_and_its_result_is_fair(kind, size, draws):
     assert np.mean(squares) < 2.5
 
 
-def test_sound_arms_and_arms_of_other_errors_open_none():
+def test_sound_arms_and_arms_of_other_errors_open_no_effect():
     rng = np.random.default_rng(5)
     for seed in range(4):
         small = made(seed, 20)
@@ -165,7 +165,7 @@ def slow(seed, kinds=(), walks=False):
     ],
 )
 @pytest.mark.parametrize("draws", seeds(1, 6))
-def test_what_is_slow_is_told_from_errors_that_last_where_joints_are_known(kinds, walks, draws):
+def test_slow_motion_is_separated_from_errors_that_last_where_joints_are_known(kinds, walks, draws):
     squares, named = [], 0
     for seed in draws:
         cell, truth = slow(50 + seed, kinds, walks)

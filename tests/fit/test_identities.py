@@ -323,7 +323,7 @@ def test_errors_of_200_cells_scatter_as_the_covariance_says_in_every_direction(i
 
 
 @pytest.mark.parametrize("draws", seeds(5, 40))
-def test_predictions_err_as_much_as_they_say(draws):
+def test_predictions_err_as_much_as_stated(draws):
     squares = []
     for seed in draws:
         small = made(seed, stops=12)

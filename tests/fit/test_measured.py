@@ -102,7 +102,7 @@ def is_fair(squares, degrees):
 
 @pytest.mark.parametrize("draws", seeds(2, 12))
 @pytest.mark.parametrize(("in_hand", "is_declared"), [(True, True), (True, False), (False, True)])
-def test_poses_by_other_software_are_as_sure_as_they_say(in_hand, is_declared, draws):
+def test_poses_by_other_software_are_within_the_stated_sigma(in_hand, is_declared, draws):
     squares = []
     for seed in draws:
         small = made(seed, 14, in_hand=in_hand)
@@ -116,7 +116,7 @@ def test_poses_by_other_software_are_as_sure_as_they_say(in_hand, is_declared, d
 
 
 @pytest.mark.parametrize("draws", seeds(1, 6))
-def test_corners_of_a_single_tag_are_as_sure_as_they_say(monkeypatch, draws):
+def test_corners_of_a_single_tag_are_within_the_stated_sigma(monkeypatch, draws):
     tag = Target("tag", "marker", 1, 1, 0.05, 5e-5, dictionary="DICT_4X4_50", marker_id=0)
     monkeypatch.setattr(small_cells, "BOARD", tag)
     monkeypatch.setattr(small_cells, "PX", 0.3)
@@ -190,7 +190,7 @@ def test_measured_rows_have_the_slopes_that_differences_show():
 @pytest.mark.parametrize(
     "kind", ["place", "places", "places of unknown noise", "pose", "pose of unknown rotation"]
 )
-def test_what_a_tracker_read_is_as_sure_as_it_says(kind, draws):
+def test_readings_of_a_tracker_are_as_accurate_as_stated(kind, draws):
     squares, turned = [], kind.startswith("pose")
     for seed in draws:
         cell, edges = tracked(
@@ -206,7 +206,7 @@ def test_what_a_tracker_read_is_as_sure_as_it_says(kind, draws):
 
 
 @pytest.mark.parametrize("draws", seeds(2, 12))
-def test_points_that_a_tip_touched_are_as_sure_as_they_say(draws):
+def test_points_that_a_tip_touched_are_within_the_stated_sigma(draws):
     squares = []
     for seed in draws:
         cell, edges = tracked(seed, stops=24, points=3, is_touch=True)
@@ -237,7 +237,7 @@ def fit_error(solved, edges):
     return solved.fit.edge("tracker")[:3, 3] - edges["tracker"][:3, 3]
 
 
-def test_held_rows_of_a_real_tracker_err_as_much_as_they_say(real_data):
+def test_held_rows_of_a_real_tracker_err_as_much_as_stated(real_data):
     session = Session.load(real_data / "sessions" / "ur10_tracker_series_c")
     solved = solve(read_cell(session, {}))
     held = solved.start.cell.held

@@ -99,7 +99,7 @@ def test_a_shutter_that_opens_at_once_is_no_rolling_one(draws):
         assert abs(off) < 4.0 * np.sqrt(fit.covariance(("effect", "clock cam flange"))[0, 0])
 
 
-def test_what_is_open_about_clocks_predicts_nothing_at_rest():
+def test_an_unknown_clock_moves_no_prediction_at_rest():
     small = moving(0)
     fit = solve(small.cell).fit
     still = replace(small.cell.moments, rates={})

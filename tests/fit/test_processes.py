@@ -27,7 +27,7 @@ def two_arms():
 
 
 @pytest.mark.parametrize("cell", [made(stops=10, cameras=2).cell, two_arms()])
-def test_what_stops_say_alone_is_together_what_the_fit_says(cell):
+def test_information_of_single_stops_adds_up_to_that_of_the_fit(cell):
     fit, p = solve(cell).fit, None
     for flange in fit.unknowns.erring:
         alone = _alone(fit, flange)
@@ -152,7 +152,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     assert square == pytest.approx(off**2 + own, rel=1e-3)
 
 
-def test_what_held_boards_may_be_off_by_is_in_the_covariance_and_not_in_the_estimate():
+def test_errors_of_held_boards_are_in_the_covariance_and_not_in_the_estimate():
     cell, share = made(stops=16).cell, 2e-4
     edges, sigmas = {}, {}
     for factor in (1.0, 1.0 + share):
@@ -183,7 +183,7 @@ def test_a_board_that_is_doubted_and_not_freed_counts_in_the_covariance(draws):
 
 
 @pytest.mark.slow
-def test_what_is_judged_by_combinations_of_many_unknowns_is_the_same():
+def test_evidence_by_combinations_of_many_unknowns_is_the_same():
     fit = solve(made(stops=8, cameras=4).cell).fit
     alone, boards = _alone(fit, "flange"), _boards(fit)
     assert fit.unknowns.count > 6 * len(alone.stops)

@@ -14,7 +14,7 @@ from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, RobotAt, sim
 
 
 @pytest.mark.slow
-def test_a_cell_of_two_arms_is_found_as_surely_as_it_says():
+def test_a_cell_of_two_arms_is_found_within_its_covariance():
     simulated = simulate(OPTIONS)
     session = recorded(simulated)
     cell = read_cell(session, session.corners)

@@ -42,10 +42,10 @@ def test_sizes_of_chance_are_closed_together():
     assert closed([30.0, 1.0, 2.0], ["", "", ""]) == (1, 2)
 
 
-def test_what_belongs_to_something_that_is_off_stays_open():
+def test_sizes_of_a_lens_that_is_off_stay_open():
     # A given lens whose focal length is off has hardly the centre that is stated.
     assert closed([30.0, 1.0, 2.0], ["lens", "lens", "board"]) == (2,)
 
 
-def test_what_is_off_more_often_needs_less_evidence():
+def test_an_error_that_is_more_frequent_needs_less_evidence():
     assert closed([5.0, 5.0, 5.0], ["a", "b", "c"], limits=(13.8, 4.4, 13.8)) == (0, 2)

@@ -86,7 +86,7 @@ def test_a_parked_robot_counts_once_for_its_hand_eye_calibration():
 
 
 @pytest.mark.slow
-def test_a_chain_over_two_arms_is_as_sure_as_it_says():
+def test_a_chain_over_two_arms_is_within_the_stated_sigma():
     """A camera on one arm sees a board on the other, whose base is unknown, too."""
     squares = []
     for seed in range(6):

@@ -40,7 +40,7 @@ def with_prior(small, *prior):
 
 
 @pytest.mark.parametrize("draws", seeds(2, 12))
-def test_a_prior_is_worth_what_it_says(draws):
+def test_a_prior_counts_with_its_stated_sigma(draws):
     squares, gains, sigma = [], [], 5e-5
     for seed in draws:
         small = made(seed)
@@ -252,7 +252,7 @@ def test_a_stated_lens_leaves_without_its_field_as_matrix_and_distortion_explain
 
 @pytest.mark.parametrize("draws", seeds(1, 8))
 @pytest.mark.parametrize("stops", [5, 14])
-def test_the_axis_of_a_given_lens_with_wrong_decentring_is_as_sure_as_is_said(stops, draws):
+def test_the_axis_of_a_given_lens_with_wrong_decentring_is_within_its_sigma(stops, draws):
     squares = []
     for seed in draws:
         # Five views leave distortion no parameters of its own: a field shows that it is wrong.

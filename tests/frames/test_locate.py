@@ -73,7 +73,7 @@ def agrees(part, by, share=PLAIN):
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
-def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, beyond):
+def test_jacobians_of_a_ray_agree_with_central_differences(exact_cell, beyond):
     (cell, calibration), rng = exact_cell, np.random.default_rng(0)
     calibration = with_field(calibration) if beyond else calibration
     at = stand(cell, rng)
@@ -94,7 +94,7 @@ def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, beyond):
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
-def test_what_moves_a_target_agrees_with_central_differences(exact_cell, beyond):
+def test_jacobians_of_a_target_agree_with_central_differences(exact_cell, beyond):
     (cell, calibration), rng = exact_cell, np.random.default_rng(0)
     at, point = stand(cell, rng), np.array([0.1, 0.05, 0.02])
     corners = seen_corners(cell, before_camera(cell, BOARD, rng), BOARD, rng)
@@ -210,7 +210,7 @@ def test_a_place_tells_where_its_uncertainty_is_from():
     assert Located(np.zeros(3), parts, 8.0).radius95_mm > 1.15 * found.radius95_mm
 
 
-def test_what_cannot_be_located_is_refused_by_name(in_hand):
+def test_a_place_that_cannot_be_located_is_refused_by_name(in_hand):
     cell, calibration = in_hand
     at = stand(cell, np.random.default_rng(4))
     middle, flange = np.array([[640.0, 400.0]]), at.base_from_flange
@@ -236,7 +236,7 @@ def test_what_cannot_be_located_is_refused_by_name(in_hand):
         locate(replace(calibration, camera=None), middle, level, flange)
 
 
-def test_what_may_mislead_is_told(in_hand):
+def test_a_place_that_may_mislead_has_a_warning(in_hand):
     cell, calibration = in_hand
     rng = np.random.default_rng(6)
     at = stand(cell, rng)
@@ -287,7 +287,7 @@ def test_corners_that_do_not_fit_are_left_out_refused_or_counted(in_hand):
         locate_target(calibration, empty[:480, :640], BOARD, at.base_from_flange)
 
 
-def test_a_camera_that_was_stated_beside_measured_poses_looks(tmp_path):
+def test_a_stated_camera_beside_measured_poses_locates(tmp_path):
     cell = simulate(CellOptions(views=12))
     told = Session.load(write_session(cell, tmp_path / "session", images=False))
     table = {"camera": session_of(cell).document["camera"]}
@@ -454,8 +454,11 @@ def test_pixels_are_placed_on_planes(cell):
         ({"source": "part/views.csv", "target": "charuco_9x6_30mm"}, "cannot be decoded"),
         ({"pixel": ["1"], "plane": "z=0"}, "--pixel is '1', but must be u,v"),
         ({"pixel": ["1,2"], "plane": "z=low"}, "--plane z is 'low'"),
-        ({"pixel": ["1,2"], "plane": "gig"}, "'gig', .* there are: .*base_from_jig"),
-        ({"pixel": ["1,2"], "plane": "base_from_cam"}, "no frame in the base"),
+        (
+            {"pixel": ["1,2"], "plane": "gig"},
+            "'gig', but must be a frame in the base: .*base_from_jig",
+        ),
+        ({"pixel": ["1,2"], "plane": "base_from_cam"}, "must be a frame in the base"),
         ({"pixel": ["1,2"], "plane": "0,0,0,5"}, "has no direction"),
         ({"pixel": ["1,2"], "plane": "z=0", "plane_sigma": -1.0}, "standard deviation"),
         ({"pixel": ["1,2"], "plane": "z=0", "pose": "0,0,0,0,0,0,2"}, "not a quaternion"),
@@ -578,7 +581,7 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
 def test_targets_are_printed_and_gaps_join_the_result(proved):
     folder, look, _ = proved
     out = folder / "out"
-    visioncal("touch-test", look, "-c", out, *GAUGE[2:]).refused("Say --tool none, too")
+    visioncal("touch-test", look, "-c", out, *GAUGE[2:]).refused("Give --tool none, too")
     done = visioncal("touch-test", look, "-c", out, *GAUGE).good()
     assert done.out.count("hover:") == done.out.count("touch:") == 5
     targets = json.loads(visioncal("touch-test", look, "-c", out, *GAUGE, "--json").out)["points"]
@@ -630,7 +633,7 @@ def test_one_image_of_a_camera_that_stands_still_shows_where_to_touch(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_touches_is_the_only_tool_or_the_flange(proved):
+def test_the_only_tool_touches_or_else_the_flange(proved):
     folder, look, _ = proved
     known = Calibration.load(folder / "out")
     grip = compose(np.eye(3), np.array([0.0, 0.0, 0.12]))

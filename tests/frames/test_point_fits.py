@@ -190,7 +190,7 @@ def test_features_that_contradict_each_other_are_refused(kind):
     assert caught.value.culprits[0] in {"0", "1"}
 
 
-def test_wrong_touches_of_an_axis_are_left_out_where_others_tell():
+def test_wrong_touches_of_an_axis_are_left_out_where_others_agree():
     for axes, at, left_out in ((3, 11, [11]), (1, 10, [])):
         made = touches_of(Job(axes=axes), 5)
         aside = 5e-3 * made.truly[at].apply(TURN.apply([1, 0, 0]))
@@ -381,7 +381,7 @@ def test_known_and_unknown_noise_add_up():
     assert np.median(levels) == pytest.approx(2 * NOISE_M, rel=0.1)
 
 
-def test_the_frame_moves_with_each_point_as_it_says():
+def test_the_frames_derivatives_by_points_are_right():
     frame, pairs = measured_part(5, 5, 0.0)
     pairs = replace(pairs, covariances=uneven(np.random.default_rng(5), 5))
     found = fit_points(pairs).agreement.fit.by_points

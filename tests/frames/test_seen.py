@@ -72,7 +72,7 @@ def sights_of(cell, parent, place, rng, count=6, target=BOARD):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mount", "parent"), [(IN_HAND, "base"), (TO_HAND, "flange")])
-def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
+def test_jacobians_of_a_sight_agree_with_central_differences(mount, parent):
     cell = simulate(exact(CellOptions(mount=mount, views=8, seed=1)))
     eye, rng = CalibratedCamera.of(calibration_of(cell)), np.random.default_rng(0)
     place = place_of(cell, parent, rng)
@@ -140,7 +140,7 @@ def test_views_from_several_sides_tell_how_large_a_target_is():
     assert 0.5 < np.mean(surprises) < 1.6
 
 
-def test_what_images_share_is_no_scatter_and_what_one_has_alone_leaves_it_out():
+def test_an_error_of_all_images_is_no_scatter_and_one_of_a_single_image_leaves_it_out():
     cell, calibration = calibrated(IN_HAND, 0)
     rng, name = np.random.default_rng(0), "flange_from_cam"
     place, edge = place_of(cell, "base", rng), calibration.edges[name]
@@ -308,7 +308,7 @@ def test_views_that_show_nothing_are_named():
     assert told.startswith("3 of 7 views")
 
 
-def test_one_image_or_one_stop_checks_nothing():
+def test_one_image_or_one_stop_is_no_check():
     cell, calibration = calibrated_cell(IN_HAND)
     alone = seen_frame(session_of(cell, shots(cell, 1)), calibration, "fixture")
     assert alone.verdict.status == "check"
@@ -379,7 +379,7 @@ def test_sessions_of_another_camera_are_refused():
     raised(DataError, "millimetres", seen_frame, session, calibration, "fixture", (0.0, 0.0, 120.0))
 
 
-def test_doubts_of_calibration_and_sigma_are_told():
+def test_doubts_of_calibration_and_sigma_are_reported():
     cell, calibration = calibrated_cell(IN_HAND)
     session = session_of(cell, shots(cell, 3))
     bad = replace(calibration, verdict=Verdict.of("bad", "The views disagree."))

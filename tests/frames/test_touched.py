@@ -185,7 +185,7 @@ def test_two_exchanged_names_are_named():
 
 @pytest.mark.parametrize("count", [5, 6])
 @pytest.mark.parametrize("change", [[1, -1, 1], [-1, 1, 1]])
-def test_a_mirrored_drawing_is_a_bad_one(count, change):
+def test_a_mirrored_drawing_is_bad(count, change):
     """Though most of its points lie in one plane, and agree."""
     frame = drawn(CAD_MM[:count], NAMES[:count], cad_mm=CAD_MM * change)
     assert frame.verdict.status == "bad"
@@ -209,7 +209,7 @@ def test_a_point_that_was_touched_several_times_counts_as_one():
     raised(DataError, "2 measured points", drawn, np.tile(CAD_MM[:2], (3, 1)), NAMES[:2] * 3)
 
 
-def test_a_part_of_another_size_is_told_and_not_absorbed():
+def test_a_part_of_another_size_is_reported_and_not_absorbed():
     frame = drawn(1.002 * CAD_MM, NAMES)
     (reason,) = frame.verdict.reasons
     assert reason.startswith("The part is 1.00")
@@ -332,11 +332,11 @@ LINE = np.outer(np.arange(8), [50, 0, 0])
         ({"names": NAMES[::-1]}, "The points have each other's names (P1 is P8, P2 is P7,"),
         ({"names": NAMES[1:] + NAMES[:1]}, "P8 is P7): corrected, all points agree to 0."),
         ({"names": ("p1", "P22", *NAMES[2:])}, "cad.csv has no point P22; it has P1, P2"),
-        ({"names": ("", *NAMES[1:])}, "touches.csv, line 2: which point was touched is not said"),
-        ({"names": ("",) * 8}, "touches.csv: which point was touched is not said"),
+        ({"names": ("", *NAMES[1:])}, "touches.csv, line 2: the touched point is not named"),
+        ({"names": ("",) * 8}, "touches.csv: the touched point is not named"),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path, tool_file, changes, words):
+def test_a_contradicting_request_is_refused(tmp_path, tool_file, changes, words):
     fixture(tmp_path, tool_file, "-o", tmp_path / "new.json", **changes).refused(words)
     assert not (tmp_path / "new.json").exists()
 
@@ -398,7 +398,7 @@ def test_a_drawings_own_sigma_counts(tmp_path, tool_file):
     assert "the sigma is negative" in visioncal("fixture", touches, "--cad", cad, "--tool=none").err
 
 
-def test_which_tool_touched(tmp_path, tool_file):
+def test_the_tool_that_touched_is_named_or_found(tmp_path, tool_file):
     cad, touches = cad_file(tmp_path / "cad.csv"), touches_file(tmp_path / "touches.csv")
     two = tmp_path / "two.json"
     made.alone({"flange_from_gripper": made.frame(made.FLANGE_FROM_TOOL), **made.tool()}).save(two)
@@ -408,7 +408,7 @@ def test_which_tool_touched(tmp_path, tool_file):
 
     run("--tool", f"{two}:gripper").good()
     run("--tool", f"{tool_file}:flange_from_tool").good()
-    run().refused("The tool that touched the points is not said", "--tool none")
+    run().refused("The tool that touched the points is not stated", "--tool none")
     run("--tool", two).refused("has 2 tools: flange_from_gripper, flange_from_tool")
     run("--tool", f"{two}:griper").refused("Did you mean flange_from_gripper")
 
@@ -702,7 +702,7 @@ def test_wrong_rows_are_refused_by_their_place(tmp_path):
         return visioncal("tcp", path)
 
     run("\n".join([*lines, lines[3].replace("3,", "11,", 1)])).refused(
-        "touches.csv, line 4 and touches.csv, line 12 have the very same pose"
+        "touches.csv, line 4 and touches.csv, line 12 have the same pose"
     )
     run("\n".join(lines).replace("2,point", "2,pint")).refused(
         "touches.csv, line 3: kind is 'pint'", "Did you mean point?"
@@ -773,7 +773,7 @@ def test_a_tool_joins_its_calibration(out, tmp_path):
     assert "it replaces the one of" in again.err
     # A fixture of the same name would hang the frame in two places.
     visioncal("fixture", tmp_path / "touches.csv", "-c", out, "--name", "gripper").refused(
-        "'gripper' is taken: flange_from_gripper is there already"
+        "'gripper' is taken: flange_from_gripper already exists"
     )
     whole = (out / "calibration.json").read_bytes()
     tcp(tmp_path, touches, "-o", out / "calibration.json").refused("is a calibration", "-c")

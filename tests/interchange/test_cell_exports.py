@@ -209,7 +209,7 @@ def test_the_file_says_where_it_comes_from(name):
     [SAMPLE, replace(SAMPLE, arm=ArmResult(level="nominal", levels=())), alone(tool())],
     ids=["none", "nominal", "frames"],
 )
-def test_without_a_calibrated_arm_the_next_step_is_told(name, source):
+def test_without_a_calibrated_arm_the_next_step_is_reported(name, source):
     raised(DataError, r"needs a calibrated arm.*q1_rad", export, source, name)
 
 
@@ -314,11 +314,11 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
         ("easy-handeye", Selection(), "holds the camera"),
     ],
 )
-def test_what_cannot_be_written_is_refused(to, selection, words):
+def test_a_selection_that_cannot_be_written_is_refused(to, selection, words):
     raised(DataError, words, export, CELL, to, selection)
 
 
-def test_what_needs_one_camera_takes_the_only_one_that_fits(tmp_path):
+def test_a_format_of_one_camera_takes_the_only_one_that_fits(tmp_path):
     write_json(tmp_path / "calibration.json", to_document(CELL))
     for path in (tmp_path, tmp_path / "calibration.json"):
         found = load_calibration(path)

@@ -73,7 +73,7 @@ def off(name, text, matrix):
 
 
 @pytest.mark.parametrize("name", READERS | FRAME_READERS)
-def test_what_is_read_back_is_the_transform(name):
+def test_the_exported_transform_is_read_back(name):
     for kind, rotations in CASES.items():
         # Robots' forms are written to the nanometre and to 1e-8 deg; others to the last digit.
         # FANUC's programs have 1e-6 deg, half of which may be cut from each of three angles.
@@ -453,7 +453,7 @@ def test_halcon_holds_no_rays_beside_the_plane():
         ("fisheye", [0.02, -0.01, 0.004, -0.001]),
     ],
 )
-def test_a_poorer_lens_sees_the_same_rays_as_near_as_it_says(name, model, distortion):
+def test_a_poorer_lens_sees_the_same_rays_as_near_as_stated(name, model, distortion):
     camera = Camera(
         model, (1280, 800), np.array([1400.1, 1402.2, 640.3, 395.2]), np.array(distortion)
     )
@@ -497,7 +497,7 @@ def test_a_lens_within_a_poorer_model_stays_as_it_is():
     raised(DataError, "pinhole", export, source, "kalibr", Selection(lens="pinehole"))
 
 
-def test_a_field_is_told_beside_the_coefficients_that_come_nearest_to_the_lens():
+def test_a_field_is_reported_beside_the_coefficients_that_come_nearest_to_the_lens():
     result = with_field(SAMPLE)
     found = document(result, "opencv")
     said = found.warnings[0]
@@ -691,7 +691,7 @@ def test_the_only_frame_of_its_kind_is_taken_and_none_of_the_other(name):
 
 
 @pytest.mark.parametrize("name", sorted(FORMATS))
-def test_what_a_format_has_no_place_for_is_refused(name):
+def test_options_that_a_format_cannot_hold_are_refused(name):
     given = {"number": {"number": 2}, "load": {"load": Load(1.0, (0.0, 0.0, 1.0))}}
     for what, chosen in given.items():
         if what not in FORMATS[name].takes:
@@ -722,7 +722,7 @@ TWO = replace(SAMPLE, frames=tool() | {"flange_from_tool_2": placed.frame(FLANGE
         (FrameFile({}), "text", Selection(), "no frames"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(source, name, chosen, words):
+def test_a_result_that_cannot_be_exported_is_refused(source, name, chosen, words):
     with pytest.raises(DataError) as caught:
         export(source, name, chosen)
     assert words in str(caught.value)

@@ -92,7 +92,7 @@ def test_positions_that_are_too_far_are_millimetres_whatever_the_form(tmp_path):
         assert read_foreign(tmp_path / "poses.csv", requested).robot.reading.unit == read
 
 
-def test_what_a_form_says_besides_poses_is_kept(tmp_path):
+def test_content_beside_the_poses_is_kept(tmp_path):
     recording = industrial(tmp_path / "in")
     session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.mount == "eye-in-hand"
@@ -409,7 +409,7 @@ def test_degrees_in_a_form_of_radians_are_named_first(tmp_path, logged, monkeypa
     logged(names, poses.tolist())
     followed = follow("convert", "log.csv", "out", "--mount", "eye-in-hand", "--robot-form", form)
     degrees = "rpy-deg" if form == "rpy" else "rotation-vector-deg"
-    assert f"\nSay --robot-form {degrees}, where" in followed.runs[0].refused().err
+    assert f"\nGive --robot-form {degrees}, where" in followed.runs[0].refused().err
     followed.last.good()
     found = poses_of(Session.load("out"), "base_from_flange")
     np.testing.assert_allclose(found, BASE_FROM_FLANGE, atol=1e-9)
@@ -521,7 +521,7 @@ def vector(pose):
     return {"rvec": numbers[3:], "tvec": numbers[:3]}
 
 
-def test_what_is_said_of_a_stream_holds_once(tmp_path):
+def test_the_stated_form_of_a_stream_applies_once(tmp_path):
     recording = streams(tmp_path)
     wanted = read_foreign(recording.source, recording.requested).stream.poses
     table = np.loadtxt(recording.source, delimiter=",")
@@ -592,7 +592,7 @@ def test_half_a_pose_is_refused_by_its_row(logged):
 
 
 @pytest.mark.parametrize("form", ["seven numbers", "a matrix", "seven names"])
-def test_an_order_that_nothing_tells_is_said(rows, form):
+def test_an_order_that_nothing_determines_is_reported(rows, form):
     numbers = quaternions(BASE_FROM_FLANGE)
     fields = {
         "seven numbers": lambda at: {"robot_pose": numbers[at].tolist()},
@@ -622,7 +622,7 @@ BY_COLUMNS = [525.0, 0, 0, 0, 526, 0, 319.5, 239.5, 1]
         ([525, 0, 320, 0, -526, 240, 0, 0, 1], "above 0"),
     ],
 )
-def test_a_camera_matrix_by_rows_or_by_columns_or_none(tmp_path, matrix, words):
+def test_a_camera_matrix_is_read_by_rows_or_by_columns_or_refused(tmp_path, matrix, words):
     (tmp_path / "lens.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
     if words:
         raised(DataError, words, read_intrinsics, tmp_path / "lens.json")
@@ -696,7 +696,7 @@ def test_links_that_lead_out_are_not_followed(tmp_path, naming):
     assert [path.name for path in files_in(tmp_path / "alias")] == ["b.png", "own.png"]
 
 
-def test_what_is_no_image_is_not_copied(tmp_path, naming):
+def test_a_file_that_is_no_image_is_not_copied(tmp_path, naming):
     (tmp_path / "a.png").write_text("root:x:0:0")
     picture(tmp_path / "b.png")
     raised(DataError, r"a\.png must be an image", naming, "a.png", "b.png")
@@ -705,7 +705,7 @@ def test_what_is_no_image_is_not_copied(tmp_path, naming):
     raised(DataError, r"b\.png must be an image", session.save, tmp_path / "out")
 
 
-def test_images_are_looked_for_beside_and_some_must_be_there(tmp_path, table):
+def test_images_are_searched_beside_the_table_and_some_must_exist(tmp_path, table):
     poses = quaternions(BASE_FROM_FLANGE).tolist()
     rows = [[f"{at}.png", *pose] for at, pose in enumerate(poses)]
     source = table("file,x,y,z,qx,qy,qz,qw", rows)
@@ -758,7 +758,7 @@ def test_there_and_back_again(folder, tmp_path):
     assert content(again) == content(folder)
 
 
-def test_what_is_there_stays_and_force_replaces_a_recording_alone(folder, tmp_path):
+def test_existing_files_stay_and_force_replaces_a_recording_alone(folder, tmp_path):
     for name in ("taken", "taken.rrd"):
         (tmp_path / name).write_bytes(b"kept")
         raised(DataError, "exists, and nothing is overwritten", convert, folder, tmp_path / name)
@@ -791,7 +791,7 @@ def test_the_command_converts_and_refuses(folder, tmp_path):
     typed("convert", folder, tmp_path / "new.rrd").refused("--force")
 
 
-def test_what_describes_somebody_elses_poses_is_refused_for_a_session(folder, tmp_path):
+def test_options_of_foreign_poses_are_refused_for_a_session(folder, tmp_path):
     typed("convert", folder, tmp_path / "new", "--robot-unit", "mm").refused("is a session already")
     assert not (tmp_path / "new").exists()
 

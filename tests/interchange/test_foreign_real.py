@@ -154,7 +154,7 @@ def test_moveit_with_a_published_answer(real_data, calibrated, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
+def test_two_streams_by_two_clocks_are_joined(real_data, calibrated):
     folder = real_data / "pose_pairs_small/ethz_unsynchronised_streams"
     robot, camera = (
         folder / f"robot_arm_complete_bag_color_and_ir_{name}.csv"
@@ -227,7 +227,7 @@ def test_a_ur10_from_its_joints(real_data, calibrated):
 
 
 @pytest.mark.slow
-def test_a_guess_finds_what_was_not_said(real_data, tmp_path):
+def test_a_guess_finds_the_unstated_reading(real_data, tmp_path):
     source = real_data / "doosan_a0509_charuco"
     done = convert(source, tmp_path / "s", "--robot-unit", "m", "--guess", "--yes").good()
     assert "positions in mm" in done.err
@@ -278,7 +278,7 @@ def test_whole_degrees_are_read_at_the_second_attempt(real_data, tmp_path, monke
     words = ("--camera-columns", matrix, "--mount", "eye-in-hand", "--robot-form", "rpy")
     followed = follow("convert", source, "s", *words)
     # Positions beyond any arm's reach are millimetres: the form alone is asked for.
-    assert "Say --robot-form rpy-deg, " in followed.runs[0].refused("in radians").err
+    assert "Give --robot-form rpy-deg, " in followed.runs[0].refused("in radians").err
     assert followed.last.status == 0
     assert len(followed.runs) == 2
     first = Session.load(tmp_path / "s").views[0].base_from_flange()

@@ -1424,7 +1424,7 @@ def test_two_files_of_poses_ask_whose_they_are_with_the_command(tmp_path, monkey
         rows = np.hstack([turned[:, :3, 3], vectors]).tolist()
         write(tmp_path / f"in/{name}.txt", "\n".join(" ".join(map(repr, row)) for row in rows))
     followed = follow("convert", "in", "out", "--mount", session.mount)
-    assert "whose they are is not said" in followed.runs[0].refused().err
+    assert "which are the robot's is not stated" in followed.runs[0].refused().err
     assert len(followed.runs) == 2
     view = Session.load(tmp_path / "out").views[0]
     np.testing.assert_allclose(view.base_from_flange().as_matrix(), poses[0], atol=1e-9)
@@ -1454,7 +1454,7 @@ def test_the_numbers_of_one_side_never_serve_as_both(tmp_path, monkeypatch, is_i
     assert "serve as both" in visioncal("doctor", "out").out
 
 
-def test_files_of_two_sides_are_told_by_their_names(tmp_path, monkeypatch):
+def test_files_of_two_sides_are_found_by_their_names(tmp_path, monkeypatch):
     """Keys of both are the same; the camera's pose is there as a matrix, too."""
     monkeypatch.chdir(tmp_path)
     poses, _, session = world()
@@ -1586,7 +1586,7 @@ def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monk
     stems_with_depth(tmp_path / "in")
     advised = visioncal("calibrate", "in").refused("asked for where no file beside").err
     asked = visioncal(*shlex.split(advised.partition("visioncal ")[2].partition(" && ")[0]))
-    asked.refused("is not said: a ChArUco board of 9 x 6 squares")
+    asked.refused("is not stated: a ChArUco board of 9 x 6 squares")
     command = next(line for line in asked.err.splitlines() if line.startswith("visioncal target"))
     visioncal(*shlex.split(command)[1:]).good()
     visioncal("convert", "in", "out", "--target", "board.toml", "--mount", "eye-in-hand").good()
@@ -1685,7 +1685,7 @@ def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_on
 def test_arrays_without_rows(tmp_path):
     np.savez(tmp_path / "in.npz", angles=np.zeros((0, 7)), poses=np.zeros((0, 4, 4)))
     error = visioncal("convert", tmp_path / "in.npz", tmp_path / "out").refused().err
-    assert "in.npz has no list with one entry a pose: it is empty" in error
+    assert "in.npz has no list with one entry per pose: it is empty" in error
 
 
 def test_quaternions_without_their_real_part(tmp_path, monkeypatch):
@@ -1753,7 +1753,7 @@ def test_motion_capture_is_the_robots_where_no_other_is(tmp_path, tracker):
         np.testing.assert_allclose(found, both, atol=1e-9)
 
 
-def test_a_mount_that_is_not_as_stated_is_said_before_a_form_is_asked_for(tmp_path, monkeypatch):
+def test_a_contradicted_mount_is_reported_before_a_form_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     poses, _, session = world()
     seen = [view.cam_from_target().as_matrix() for view in session.views]
@@ -1764,7 +1764,7 @@ def test_a_mount_that_is_not_as_stated_is_said_before_a_form_is_asked_for(tmp_pa
     write(tmp_path / "in.json", json.dumps(boards))
     refused = visioncal("convert", "in.json", "out", "--mount", other).refused().err
     assert "the camera is not mounted as stated" in refused
-    assert f"Say --mount {session.mount}" in refused
+    assert f"Give --mount {session.mount}" in refused
 
 
 def test_moves_of_a_urscript_are_poses_of_the_tool_that_it_sets(tmp_path):
@@ -2024,7 +2024,7 @@ def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(t
 
 
 @pytest.mark.slow
-def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):
+def test_images_are_searched_once_where_few_rows_decide_nothing(tmp_path, monkeypatch):
     session = world()[2]
     shoot(tmp_path / "in", "img{:02d}.png")
     np.save(tmp_path / "in/poses.npy", angles_of("xyz"))

@@ -71,7 +71,7 @@ LINES = {
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_line_means_what_its_maker_says(line):
+def test_a_line_is_read_as_its_maker_defines_it(line):
     found = read_pose(line, "the line")
     # To rounding.
     assert np.abs(found.pose - a_pose(LINES[line])).max() < 1e-12
@@ -147,7 +147,7 @@ def test_a_pose_that_is_shown_can_be_typed_back(form):
     assert np.abs(read.pose - pose).max() < 2e-5
 
 
-def test_bare_numbers_are_what_the_user_says():
+def test_bare_numbers_are_read_in_the_stated_form():
     for form, rotation in (
         ("ur", Rotation.from_rotvec([0.1, -0.2, 3.0])),
         ("rpy", Rotation.from_euler("xyz", [0.1, -0.2, 3.0])),
@@ -157,7 +157,7 @@ def test_bare_numbers_are_what_the_user_says():
 
 
 @pytest.mark.parametrize("form", ["ur", "kuka", "fanuc", "abb", "doosan"])
-def test_what_is_exported_can_be_pasted_back(form):
+def test_an_exported_pose_can_be_pasted_back(form):
     for rotation in CASES["any"]:
         matrix = compose(rotation, SHIFT)
         edges = {**SAMPLE.edges, "flange_from_cam": Edge(matrix, np.eye(6))}
@@ -266,7 +266,7 @@ def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(number
         ("[[400,0,0],[0.5,0.5,0.5,0.4]]", None, "not a quaternion w, x, y, z"),
     ],
 )
-def test_what_cannot_be_or_may_be_several_things_is_refused(line, form, words):
+def test_an_impossible_or_ambiguous_pose_is_refused(line, form, words):
     with pytest.raises(DataError) as caught:
         read_pose(line, "the line", form)
     assert words in str(caught.value)

@@ -217,7 +217,7 @@ def test_loads_stand_in_columns_or_in_the_names_of_groups(tmp_path, heads, cells
     np.testing.assert_allclose(views[0].joints_rad, views[STOPS].joints_rad)
 
 
-def test_what_is_missing_is_named_with_the_next_step(tmp_path):
+def test_missing_columns_are_named_with_the_next_step(tmp_path):
     row = reads(["M{stop}"])
     points = joined([["Name", "Actual X", "Actual Y", "Actual Z"], *(row(*r) for r in shop().rows)])
     (tmp_path / "points.csv").write_text(points)

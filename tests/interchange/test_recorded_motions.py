@@ -208,7 +208,7 @@ def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
         ({"poses": "pose"}, "how the camera is mounted is not known", "--mount"),
     ],
 )
-def test_what_a_bag_lacks_is_said(options, message, step, source, rendered, tmp_path):
+def test_missing_topics_of_a_bag_are_named(options, message, step, source, rendered, tmp_path):
     path = bag(tmp_path / "b", source, rendered, is_compressed=True, **options)
     caught = raised(DataError, message, convert, path, tmp_path / "out", requested=BOARD)
     assert step in caught.next_step
@@ -339,7 +339,7 @@ def test_image_files_of_a_data_set_are_read_inside_its_folder(source, rendered, 
     raised(DataError, "leaves the folder", convert, path, tmp_path / "none", requested=BOARD)
 
 
-def test_what_is_damaged_is_refused(source, rendered, dataset, tmp_path):
+def test_a_damaged_bag_is_refused(source, rendered, dataset, tmp_path):
     path = bag(tmp_path / "b.bag", source, rendered, form="ros1", is_compressed=True)
     path.write_bytes(path.read_bytes()[:100_000])
     raised(DataError, "cannot be read as a bag", convert, path, tmp_path / "out", requested=BOARD)

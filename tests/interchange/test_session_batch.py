@@ -86,7 +86,7 @@ def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("here")
-def test_what_was_done_is_kept(fleet, tmp_path):
+def test_finished_sessions_are_kept_by_another_batch(fleet, tmp_path):
     found = batch(fleet / "robot_*/week_1", tmp_path, without=BARE)
 
     def of(name):

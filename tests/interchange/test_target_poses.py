@@ -203,7 +203,7 @@ def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
         done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said)
         done.refused("the corners do not say for which size", "--resolution")
         lacking = visioncal("convert", tmp_path / "in", tmp_path / "out", *said[:2])
-        lacking.refused("there are corners, but what target they show is not known", "--target")
+        lacking.refused("there are corners, but their target is not known", "--target")
         said += ["--resolution", "640,400"]
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
     assert "Found by the corners" in done.err
@@ -375,7 +375,7 @@ def test_other_motions_are_known_by_their_turns_before_any_fit():
 
 
 @pytest.mark.slow
-def test_what_keeps_images_from_telling_a_form_comes_before_the_form(tmp_path, monkeypatch):
+def test_a_fault_of_the_images_precedes_the_question_of_the_form(tmp_path, monkeypatch):
     sample = made_up(9).session
     sample.save(tmp_path / "shots")
     poses = np.array([view.base_from_flange().as_matrix() for view in sample.views])
@@ -410,7 +410,7 @@ def test_rows_of_another_recording_are_doubted_before_their_form(tmp_path):
     done = visioncal("convert", tmp_path / "in.json", tmp_path / "out", "--mount", mount)
     words = done.refused("No reading that was tried stands out").err
     assert words.index("these rows are those of these images") < words.index(
-        "Else say --robot-form"
+        "Else give --robot-form"
     )
     # Columns that are one pose are described in one line.
     pose = np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])

@@ -456,7 +456,7 @@ def asked(camera, capture, *times_s, pause_s=0.0, last_s=0.0):
     return int(frame.image[0, 0, 0]), frame
 
 
-def test_what_was_under_way_when_it_was_asked_for_is_passed_by(capture):
+def test_a_frame_that_was_under_way_at_the_request_is_skipped(capture):
     camera = opened(capture)
     number, frame = asked(camera, capture, 0.0, 0.0, pause_s=0.05)
     assert number == 3
@@ -487,7 +487,7 @@ def test_a_kernels_time_is_taken_where_it_can_be_true(capture):
     assert frame.exposure_s == 0.02
 
 
-def test_a_camera_that_hangs_or_ends_is_told(capture):
+def test_a_camera_that_hangs_or_ends_is_reported(capture):
     camera = opened(capture)
     for _ in range(2):
         with pytest.raises(DriverError, match=r"camera 0 stalls: no picture has come for 0\.\d s"):
@@ -499,7 +499,7 @@ def test_a_camera_that_hangs_or_ends_is_told(capture):
     assert not camera._thread.is_alive()
 
 
-def test_pictures_that_all_come_late_are_told(capture):
+def test_pictures_that_all_come_late_are_reported(capture):
     camera = opened(capture)
     old_s = time.monotonic()
     time.sleep(0.01)

@@ -129,7 +129,7 @@ def test_a_failure_on_the_way_halts_and_leaves_a_session(plan, tmp_path, failure
 
 
 @pytest.mark.slow
-def test_a_board_that_is_lost_once_is_told_and_three_times_ends(plan, tmp_path):
+def test_a_board_that_is_lost_once_is_reported_and_three_times_ends(plan, tmp_path):
     arm, camera = fake_devices(plan)
     # The first move goes to the first stop.
     camera.hidden_at = (2,)
@@ -187,7 +187,7 @@ def test_joints_and_poses_of_other_moments_disagree(plan):
     assert "4 joints, and ur5e has 6" in check.why_not(replace(first, q=np.zeros(4)))
 
 
-def test_an_arm_that_hangs_or_ends_elsewhere_is_told(plan, tmp_path):
+def test_an_arm_that_hangs_or_ends_elsewhere_is_reported(plan, tmp_path):
     arm, camera = fake_devices(plan)
     arm.moving = lambda: arm.clock.sleep(0.01) or True
     with pytest.raises(DriverError, match=r"still moving after .* s, where .* s were expected"):
@@ -236,7 +236,7 @@ def test_images_that_move_are_measured_to_a_hundredth_of_a_pixel():
     assert image_motion_px(camera.frame().image, camera.frame().image) < 0.05
 
 
-def test_a_disk_without_room_is_told_before_on_the_way_and_while_it_is_written(
+def test_a_disk_without_room_is_reported_before_on_the_way_and_while_it_is_written(
     plan, tmp_path, monkeypatch
 ):
     usage, write, written = shutil.disk_usage(tmp_path), journal_module.write_atomically, []
@@ -296,7 +296,7 @@ def test_a_killed_recording_loses_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_killed_process_left_is_removed(plan, tmp_path):
+def test_remains_of_a_killed_process_are_removed(plan, tmp_path):
     arm, camera = fake_devices(plan)
     camera.hidden_at = (5,)
     folder = tmp_path / "live"
@@ -532,7 +532,7 @@ def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):
         (("--plan", "PLAN", "--follow", "--dry-run"), "a guided arm is not driven"),
     ],
 )
-def test_what_cannot_be_is_refused_before_a_device_is_asked(planned, tmp_path, more, words):
+def test_impossible_options_are_refused_before_a_device_is_asked(planned, tmp_path, more, words):
     more = [planned[0] if value == "PLAN" else value for value in more]
     record(tmp_path / "live", *more).refused(words)
 
@@ -549,7 +549,7 @@ def test_devices_and_pictures_that_do_not_fit_are_named(planned, cell, tmp_path)
 
 
 @pytest.mark.slow
-def test_what_ends_before_its_first_view_leaves_no_folder_behind(planned, cell, tmp_path):
+def test_a_recording_that_ends_before_its_first_view_leaves_no_folder(planned, cell, tmp_path):
     """The same command can be given again; it said that its folder was not empty."""
     live, sent = tmp_path / "live", ("--plan", planned[0], "--yes")
     cell[1].hidden_at = range(9)
@@ -607,7 +607,7 @@ def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_pa
         assert np.linalg.norm(off) < REPEATABILITY_M
 
 
-def test_what_is_no_plan_is_named(tmp_path):
+def test_a_file_that_is_no_plan_is_named(tmp_path):
     file = tmp_path / "plan.json"
     raised(DataError, "does not exist", read_plan, tmp_path)
     for text, words in (

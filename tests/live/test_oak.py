@@ -161,7 +161,7 @@ def test_a_device_is_held_where_automatic_exposure_and_focus_went(monkeypatch):
     assert device.is_closed
 
 
-def test_what_is_wished_is_set_from_the_start(monkeypatch):
+def test_requested_settings_are_made_from_the_start(monkeypatch):
     _, seen = a_device(monkeypatch, is_colour=False)
     requested = DeviceSetup((640, 400), 5000, 200, 90)
     camera = OakCamera("", requested)

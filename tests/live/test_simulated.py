@@ -154,7 +154,7 @@ def test_the_arm_is_asked_for_the_time_of_exposure():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("patient")
-def test_a_recording_is_as_near_to_the_truth_as_it_says(tmp_path):
+def test_a_recording_is_as_near_to_the_truth_as_stated(tmp_path):
     pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
     visioncal("demo", "--live", "-o", tmp_path, "--views", 6).good()
     views = Session.load(tmp_path / "session").views
@@ -193,7 +193,7 @@ def test_a_slip_of_an_encoder_is_recovered_in_a_rehearsal(tmp_path):
     assert len(Session.load(tmp_path / "recovery/stops").views) == 15
 
 
-def test_the_cell_is_guessed_as_roughly_as_is_said():
+def test_the_cell_is_guessed_as_roughly_as_stated():
     cell, again = Bench(5), Bench(5)
     for guess, true, same in zip(
         (cell.known.x, cell.known.z),

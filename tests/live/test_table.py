@@ -275,7 +275,7 @@ def test_requests_while_a_trial_runs_are_all_done_at_once(recording):
     wait_until(lambda: len(station.snapshot.views) == 6)
 
 
-def test_a_second_browser_is_told_why_it_is_refused(recording):
+def test_a_second_browser_is_refused_with_the_reason(recording):
     station = recording.station
     first, second = Visitor(station.snapshot), Visitor(station.snapshot)
     takes(station, first, 1)

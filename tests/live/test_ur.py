@@ -134,7 +134,9 @@ def test_watching_needs_no_remote_control_and_moves_nothing(controller):
         ("remote-off", "local control.*Remote Control", "normal"),
     ],
 )
-def test_a_motion_that_is_stopped_is_told_with_what_to_press(controller, fault, message, safety):
+def test_a_motion_that_is_stopped_is_reported_with_what_to_press(
+    controller, fault, message, safety
+):
     with closing(UrArm(controller.host)) as arm:
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
         assert arm.moving()

@@ -46,7 +46,9 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("fault", "message"), FAULTS, ids=[name for name, _ in FAULTS])
-def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fault, message):
+def test_the_state_that_keeps_an_arm_from_moving_is_named_with_the_button_to_press(
+    controller, fault, message
+):
     controller.inject(fault)
     try:
         raised(DriverError, message, read_condition(controller.host).check_moves)
@@ -56,7 +58,7 @@ def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fa
 
 
 @pytest.mark.slow
-def test_a_frozen_controller_is_said_to_be_silent(controller):
+def test_a_frozen_controller_is_reported_as_silent(controller):
     controller.inject("silent")
     try:
         raised(DriverError, "does not answer: timed out", read_condition, controller.host)
@@ -95,7 +97,7 @@ def listening(host, port, greeting):
         ("URSoftware 10.7.0.1000", "has PolyScope 10.7.0"),
     ],
 )
-def test_an_unfit_version_is_told(version, message):
+def test_an_unfit_version_is_reported(version, message):
     host, banner = free_host(), "Connected: Universal Robots Dashboard Server"
     with (
         listening(host, 29999, f"{banner}\n{version}\n".encode()),
@@ -105,7 +107,7 @@ def test_an_unfit_version_is_told(version, message):
     assert refusal.value.next_step
 
 
-def test_closed_ports_and_unknown_names_are_told_apart():
+def test_closed_ports_and_unknown_names_are_distinguished():
     raised(DriverError, r"port 29999 \(the dashboard\) is closed", read_condition, free_host())
     with pytest.raises(DriverError, match=r"no-such-robot\.invalid cannot be reached"):
         read_condition("no-such-robot.invalid")
@@ -128,7 +130,7 @@ def test_polyscope_x_is_watched_without_a_dashboard_and_not_driven():
             UrArm(running.host, watch_only=True)
 
 
-def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):
+def test_a_missing_client_library_is_reported_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
     monkeypatch.setitem(extras._NEWEST_PYTHON, "ur", sys.version_info[:2])
     with pytest.raises(DriverError, match=r"rtde_receive cannot be imported.*pip install 'ur-rtde"):
@@ -138,7 +140,7 @@ def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monk
         UrArm("127.0.0.1")
 
 
-def test_what_a_stall_takes_is_left_out():
+def test_the_time_of_a_stall_is_left_out():
     times = iter([100.0, 100.05, 100.1, 107.0, 107.05, 200.0, 200.1])
     watch = Stopwatch(lambda: next(times))
     # Two steps as they are, the stall as 0.2 s.

@@ -150,7 +150,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
         ("ur5e", {}, ("--need-mm", "0.2", "--for", "offsets"), "these stops are for the arm"),
     ],
 )
-def test_what_cannot_be_planned_is_refused_by_name(source, cell, more, words, tmp_path):
+def test_a_source_that_cannot_be_planned_is_refused_by_name(source, cell, more, words, tmp_path):
     assert "Traceback" not in plan(source, tmp_path / "out", *more, **cell).refused(words).err
     assert not (tmp_path / "out").exists()
 
@@ -177,7 +177,7 @@ def test_stops_are_planned_until_a_need_is_met_in_prediction(tmp_path):
 
 
 @pytest.mark.slow
-def test_arms_that_no_ur_program_drives_get_none(tmp_path):
+def test_arms_that_no_ur_program_drives_get_no_program(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "plan.script").write_text("of an earlier plan")

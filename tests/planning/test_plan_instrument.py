@@ -124,5 +124,5 @@ def test_stops_are_added_to_a_session_and_what_was_recorded_counts(tmp_path):
         ((ARM, "--mount", "instrument", "--probe", "pose", *AT500), "reads rotations is not known"),
     ],
 )
-def test_what_is_missing_is_named(arguments, words, tmp_path):
+def test_missing_inputs_are_named(arguments, words, tmp_path):
     assert words in command("plan", *arguments, "-o", tmp_path / "plan").refused().err

@@ -138,7 +138,7 @@ def test_views_without_rows_of_corners_csv_survive(sample, tmp_path):
 @pytest.mark.parametrize(
     ("step", "words"), [(1, "Install visioncal 9.1 or newer"), (-1, "folder again")]
 )
-def test_another_format_says_what_to_do(step, words, sample, tmp_path, monkeypatch):
+def test_another_format_is_refused_with_the_next_step(step, words, sample, tmp_path, monkeypatch):
     with monkeypatch.context() as other:
         other.setattr(codec, "FORMAT", codec.FORMAT + step)
         other.setattr(codec, "__version__", "9.1")
@@ -152,11 +152,11 @@ def test_images_stay_in_the_recording_until_they_are_read(sample, tmp_path):
     session = Session.load(path)
     image = session.views[2].image
     write_session(path, made_up(2).session)
-    raised(DataError, r"not there any more|replaced since", session.images.read, image)
+    raised(DataError, r"no longer exists|replaced since", session.images.read, image)
     raised(DataError, r"no image none\.png", session.images.read, "none.png")
 
 
-def test_missing_and_shared_images_stay_so(sample, tmp_path):
+def test_missing_and_shared_images_stay_missing_and_shared(sample, tmp_path):
     first, second, third = sample.session.views[:3]
     views = (first, replace(second, image=first.image), replace(third, image="images/none.png"))
     session = replace(sample.session, views=views)
@@ -165,7 +165,7 @@ def test_missing_and_shared_images_stay_so(sample, tmp_path):
     assert not again.images.exists("images/none.png")
 
 
-def test_what_is_no_recording_is_refused(recorded, tmp_path):
+def test_a_file_that_is_no_recording_is_refused(recorded, tmp_path):
     junk, cut, foreign = (tmp_path / f"{name}.rrd" for name in ("junk", "cut", "foreign"))
     junk.write_bytes(b"no recording" * 100)
     cut.write_bytes(recorded.read_bytes()[:500])

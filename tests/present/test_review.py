@@ -46,7 +46,7 @@ def is_open(host, port):
         return connection.connect_ex((host, port)) == 0
 
 
-def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
+def test_a_source_that_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
     session, empty, other = (tmp_path / name for name in ("session", "empty", "other.rrd"))
     session.mkdir()
     (session / "session.toml").write_text("schema = 1\n")
@@ -61,7 +61,7 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
         visioncal("show", "--viewer", path).refused(words)
 
 
-def test_it_opens_at_the_worst_view_or_at_the_named_one(out, monkeypatch):
+def test_the_viewer_opens_at_the_worst_view_or_at_the_named_one(out, monkeypatch):
     opened = []
     monkeypatch.setattr(viewer, "review_native", lambda _, row: opened.append(row))
     views = load_result(out / "recording.rrd").views

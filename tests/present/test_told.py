@@ -176,7 +176,7 @@ def now():
 
 
 @pytest.mark.parametrize("name", json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else [])
-def test_pages_and_notes_say_what_they_said(name, now):
+def test_pages_and_notes_keep_their_words(name, now):
     kept = json.loads(KEPT.read_text("utf-8"))[name]
     assert [FIGURE.sub("0", line) for line in now[name]] == [FIGURE.sub("0", line) for line in kept]
     # A figure that is rounded for print may end on the neighbouring digit with other last bits.

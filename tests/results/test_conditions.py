@@ -171,7 +171,7 @@ def test_a_stated_lens_and_a_bad_result_have_no_such_condition(tilted):
     assert bad.conditions == ()
 
 
-def test_every_output_carries_it(tilted, tmp_path):
+def test_every_output_carries_the_condition(tilted, tmp_path):
     (condition,) = tilted.conditions
     write_certificate(tmp_path / "page.html", tilted, None, {})
     assert "own lens" in (tmp_path / "page.html").read_text()

@@ -194,7 +194,7 @@ def test_without_a_seed_it_is_the_posture_nearest_to_the_middle(result):
         (np.eye(4), [0, np.nan, 0, 0, 0, 0], "must be a finite number"),
     ],
 )
-def test_what_is_no_target_or_no_seed_is_refused(result, targets, seed, said):
+def test_malformed_targets_and_seeds_are_refused(result, targets, seed, said):
     raised(DataError, said, visioncal.correct, result, targets, seed)
 
 
@@ -329,7 +329,7 @@ def test_targets_out_of_reach_are_named_and_nothing_is_written(stored, result):
     )
 
 
-def test_another_branch_is_told(stored, result):
+def test_another_branch_is_reported(stored, result):
     poses = result.robot.base_from_flange(np.array([HOME, [2.9, *HOME[1:]]]))
     table = write_poses(stored / "t.csv", poses)
     command = ("correct", table, "-c", stored, "--seed-joints", SEED)
@@ -366,7 +366,7 @@ def test_ways_through_singular_postures_are_found(stored, result):
         ("{POSE},q1_rad\n0.4,0.1,0.2,0,1,0,0,0.1\n", "its joints are q1_rad"),
     ],
 )
-def test_what_is_no_table_of_targets_is_named(stored, text, words):
+def test_a_table_without_targets_is_named(stored, text, words):
     names = {"POSE": "x_m,y_m,z_m,qx,qy,qz,qw", "JOINTS": ",".join(JOINTS)}
     (stored / "t.csv").write_text(text.format(**names))
     assert run("correct", stored / "t.csv", "-c", stored).refused(words).out == ""

@@ -57,7 +57,7 @@ def writer(path, first, count, acknowledged):
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
-def test_what_was_acknowledged_is_there_once(tmp_path, count):
+def test_acknowledged_entries_are_stored_once(tmp_path, count):
     """Of eight processes three are killed on the way, and start again from their first entry."""
     path, notes = tmp_path / SITE_FILE, [tmp_path / f"notes {at}" for at in range(8)]
 
@@ -253,7 +253,7 @@ def test_commands_enter_what_they_did(site, tmp_path):
     assert verified.against == calibrated.sha256
     # Old results come in by their folders, and those that are there do not come twice.
     again = visioncal("history", file, "--add", out, "--add", tmp_path / "check").good()
-    assert "0 added, 2 were there already" in again.err
+    assert "0 added, 2 existed already" in again.err
     added = visioncal("history", tmp_path / "new.db", "--cell", "line 5", "--add", out).good()
     assert "1 added" in added.err
     listed = visioncal("history", file).good().out
@@ -337,7 +337,7 @@ def world(seed, step_mm=0.0, drift_mm=0.0, looser=1.0):
 
 
 @pytest.mark.parametrize("draws", seeds(20, 60))
-def test_what_is_planted_is_found_and_nothing_else(draws):
+def test_planted_changes_are_found_and_nothing_else(draws):
     quiet = [world(seed) for seed in draws]
     # Covariances that are too small by four look like no change, either.
     quiet += [world(seed, looser=2.0) for seed in draws]

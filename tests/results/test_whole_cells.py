@@ -103,7 +103,7 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
     assert f"95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
 
 
-def test_what_was_left_out_is_told_by_camera_and_target(folder, found):
+def test_views_left_out_are_named_by_camera_and_target(folder, found):
     written = json.loads((folder / "out" / "calibration.json").read_text())["validation"]
     assert written["method"] == "leave-one-out over stops"
     # Unseen views are off by more than those that were fitted, but not by much with 20 stops.
@@ -152,7 +152,7 @@ def test_a_stated_camera_of_measured_poses_is_kept(cell):
     assert found.need.probability == pairs["left", "b"]
 
 
-def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):
+def test_a_part_of_a_cell_can_be_saved_by_itself(found, tmp_path):
     one = found.of("hand", target="floor")
     one.save(tmp_path / "calibration.json")
     again = Calibration.load(tmp_path)
@@ -166,7 +166,7 @@ def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):
 @pytest.mark.parametrize(
     ("names", "words", "step"),
     [
-        ({}, r"several cameras \(left, hand\), and which is meant is not said", "--camera left"),
+        ({}, r"several cameras \(left, hand\), and none is chosen", "--camera left"),
         ({"camera": "left"}, r"several robots \(a, b\)", "--robot a"),
         ({"camera": "lefft"}, "no camera 'lefft': its cameras are left, hand", "Did you mean left"),
         ({"robot": "c"}, "no robot 'c': its robots are a, b", ""),
@@ -176,7 +176,7 @@ def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):
         ({"camera": "hand", "robot": "b"}, "no one robot parts", "These go together: "),
     ],
 )
-def test_what_cannot_be_meant_is_said_with_the_names(found, folder, of, names, words, step):
+def test_an_ambiguous_choice_is_refused_with_the_names(found, folder, of, names, words, step):
     whole = found if of is Calibration else Session.load(folder / "session")
     assert step in raised(DataError, words, whole.of, **names).next_step
 

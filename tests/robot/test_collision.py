@@ -77,7 +77,7 @@ def test_a_thin_wall_between_two_postures_is_not_jumped_over():
     assert "wall" in walled.names[walled.path_contact(start, end)]
 
 
-def test_what_is_left_out_is_named_with_its_reason():
+def test_bodies_left_out_are_named_with_their_reason():
     cell = ur5e_with_post()
     left = {(left_out.first, left_out.second): left_out.reason for left_out in cell.left_out}
     assert ("floor", "link shoulder_pan_joint") in left
@@ -88,7 +88,7 @@ def test_what_is_left_out_is_named_with_its_reason():
         assert frozenset({f"link {joints[a]}", f"link {joints[b]}"}) in kept
 
 
-def test_what_is_guessed_is_kept_farther_away_but_from_the_arm_that_carries_it():
+def test_a_body_of_guessed_size_is_kept_farther_away_but_from_the_arm_that_carries_it():
     robot = load_robot("ur5e")
     flange = robot.chain.placements[-1][:3, 3]
     plug = capsule("plug", 6, flange, flange + np.array([0, 0, 0.1]), 0.01, unsure_m=0.05)

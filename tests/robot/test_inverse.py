@@ -98,7 +98,7 @@ def test_a_limit_in_the_way_is_kept():
     assert joints[0] <= -0.5
 
 
-def test_out_of_reach_is_told_with_the_nearest_distance():
+def test_an_unreachable_target_is_reported_with_the_nearest_distance():
     robot = load_robot("ur5e")
     found, _ = reached(robot, np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 2.0, HOME)
     assert not found.reached

@@ -130,7 +130,7 @@ def test_a_urdf_is_read_up_to_the_tip(tmp_path):
     np.testing.assert_allclose(robot.base_from_flange(q), expected, atol=1e-14)
 
 
-def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path):
+def test_an_unknown_tip_is_refused_with_the_names_of_the_frames(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     with pytest.raises(DataError, match=r"no frame 'tool'; its frames are .*tool0") as caught:
         load_robot("arm.urdf", "tool", tmp_path)
@@ -139,7 +139,7 @@ def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path):
     raised(DataError, "no tip is named; its frames are", load_robot, "bare.urdf", None, tmp_path)
 
 
-def test_what_is_no_urdf_is_refused(tmp_path, capfd):
+def test_a_file_that_is_no_urdf_is_refused(tmp_path, capfd):
     (tmp_path / "a.urdf").write_text("<robot name='x'><link name=")
     raised(DataError, "is not XML", load_robot, "a.urdf", "x", tmp_path)
     (tmp_path / "a.urdf").write_text("<robot/>")
@@ -286,7 +286,7 @@ def test_an_axis_of_few_digits_turns_rigidly():
     assert np.arccos((np.trace(start.T @ turn) - 1) / 2) == pytest.approx(0.5, abs=1e-12)
 
 
-def test_corrections_are_what_they_say():
+def test_corrections_are_as_stated():
     robot = load_robot("ur10e")
     placements, functions = some_changes(robot)
     corrected = robot.corrected(placements, functions)
@@ -319,7 +319,7 @@ def test_a_corrected_robot_stands_alone(robot, tmp_path):
         assert np.array_equal(copy.upper_rad, robot.upper_rad)
 
 
-def test_what_a_urdf_cannot_hold_is_said():
+def test_corrections_that_a_urdf_cannot_hold_are_named():
     robot = of_urdf()
     corrected = other(robot)
     assert [name.partition(":")[0] for name in unexportable_functions(corrected)] == list(
@@ -372,7 +372,7 @@ def wavy():
     return robot.corrected(*some_changes(robot), some_harmonics(robot))
 
 
-def test_they_turn_each_joint_as_they_say():
+def test_harmonics_turn_each_joint_as_stated():
     robot = load_robot("ur5e")
     q, harmonics = some_joints(robot), some_harmonics(robot)
     turned = q.copy()

@@ -66,7 +66,7 @@ def test_masses_survive_what_becomes_of_a_robot():
     assert np.abs(leaning.load_torques(q)[:, 0]).max() > 1.0 > np.abs(held[:, 0]).max()
 
 
-def test_an_arm_of_unknown_masses_weighs_nothing():
+def test_an_arm_of_unknown_masses_has_no_load_torques():
     robot = load_robot("irb120")
     assert robot.masses is None
     assert not robot.load_torques(np.zeros((1, 6))).any()

@@ -64,7 +64,7 @@ def refusal(folder):
     return caught.value
 
 
-def test_what_the_folder_holds_is_what_the_session_says(folder):
+def test_a_session_states_the_content_of_its_folder(folder):
     session = Session.load(folder)
     assert (session.name, session.mount) == ("bench", "eye-in-hand")
     assert session.camera is not None
@@ -99,7 +99,7 @@ def test_transforms_come_from_the_rows(folder):
     assert first.joints_rad is None
 
 
-def test_quaternions_of_two_decimals_are_said_to_be_rounded(folder):
+def test_quaternions_of_two_decimals_are_reported_as_rounded(folder):
     edit(folder, "views.csv", "0.6,0,0,0.8", "0.61,0,0,0.8")
     caught = raised(DataError, "norm is 1.006", Session.load, folder)
     assert "rounded to two decimals, by which a pose turns by up to 0.57 deg" in caught.next_step
@@ -213,7 +213,7 @@ def test_some_views_alone_stay_as_they_were(folder):
     raised(DataError, "no view", session.only, [])
 
 
-def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(folder, tmp_path):
+def test_the_need_of_a_task_is_read_and_can_be_overridden(folder, tmp_path):
     plain = Session.load(folder)
     assert plain.need is None
     edit(folder, "session.toml", "[robot]", "[need]\nmm = 0.5\nat = [0.4, 0, 0.1]\n[robot]")
@@ -403,7 +403,7 @@ def test_a_wrong_views_csv_is_refused_by_line_and_column(folder, old, new, words
     assert "views.csv" in error.culprits[0]
 
 
-def test_what_is_wrong_alike_in_many_rows_is_said_once(folder):
+def test_a_fault_of_many_rows_is_reported_once(folder):
     rows = [f"{k},,,images/{k}.gif,1,,,,,,,,\n" for k in range(12)]
     (folder / "views.csv").write_text(HEADER + "\n" + "".join(rows) + "x,,,a.png,1,,,,,,,,\n")
     error = refusal(folder)
@@ -438,7 +438,7 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder, separator):
     assert Session.load(folder).digest() == digest
 
 
-def test_what_is_no_session_is_refused(tmp_path):
+def test_a_folder_that_is_no_session_is_refused(tmp_path):
     raised(DataError, "nowhere.session.toml does not exist", Session.load, tmp_path / "nowhere")
     for name in ("notes.txt", "calibration.json", "recording.rrd"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
@@ -470,7 +470,7 @@ WARNINGS = [
 
 
 @pytest.mark.parametrize(("name", "old", "new", "words"), WARNINGS)
-def test_the_suspicious_is_said_and_kept(folder, name, old, new, words):
+def test_suspicious_values_are_reported_and_kept(folder, name, old, new, words):
     edit(folder, name, old, new)
     session = Session.load(folder)
     assert len(session.warnings) == 1

@@ -167,20 +167,20 @@ def test_every_storage_of_it_is_the_same_session(folder, tmp_path):
         ),
     ],
 )
-def test_what_does_not_fit_together_is_refused(folder, name, old, new, words):
+def test_contradicting_declarations_are_refused(folder, name, old, new, words):
     text = (folder / name).read_text()
     assert old in text
     (folder / name).write_text(text.replace(old, new, 1))
     assert raised(DataError, words, Session.load, folder).culprits
 
 
-def test_what_follows_from_mount_and_rows_needs_no_saying(folder):
+def test_frames_that_follow_from_mount_and_rows_need_no_declaration(folder):
     text = (folder / "session.toml").read_text()
     head = text[: text.index("[frames]")].replace(
         "[cameras.left]", 'mount = "eye-in-hand"\n[cameras.left]'
     )
     (folder / "session.toml").write_text(head)
-    with pytest.raises(DataError, match="what cam_right hangs on") as caught:
+    with pytest.raises(DataError, match="frame that carries cam_right") as caught:
         _ = Session.load(folder).frames
     assert caught.value.culprits == ("session.toml: frames.cam_right",)
     # Rows of the right camera that tell where robot b stood put it on that robot's flange.
@@ -207,7 +207,7 @@ def test_of_one_robot_what_its_camera_sees_is_in_the_cell(tmp_path):
     assert [tuple(observation.robots) for observation in session.observations] == [("",), ("",)]
 
 
-def test_what_takes_one_camera_and_robot_says_how_one_is_chosen(folder):
+def test_functions_of_one_camera_and_robot_say_how_to_choose_one(folder):
     session = Session.load(folder)
     raised(DataError, r"several robots \(a, b\)", touches_of, session)
     caught = raised(

@@ -78,7 +78,7 @@ def test_rows_without_a_pose_are_no_poses():
         (["stamp_s," + ",".join(POSE), "0,1,1,1,0,0,0,2"], "line 2, column qx ... qw: .* norm is"),
     ],
 )
-def test_what_is_wrong_is_named(lines, words):
+def test_a_faulty_stream_is_named(lines, words):
     raised(DataError, words, parsed, *lines)
 
 
@@ -86,7 +86,7 @@ def test_a_name_that_leaves_the_folder_is_refused():
     raised(DataError, "name", kept_session().with_streams, {"../robot": kept_streams()["robot"]})
 
 
-def test_gaps_are_told():
+def test_gaps_are_reported():
     stamps_s = np.arange(1000) / 500
     there = (stamps_s < 0.5) | (stamps_s > 0.9)
     (told,) = kept_session().with_streams({"robot": stream(stamp_s=stamps_s[there])}).warnings[-1:]
@@ -148,7 +148,7 @@ def test_the_digest_knows_streams_and_is_as_it_was_without():
         ("stamp_s", "1e308", "beyond every recording; write seconds"),
         ("x_m", "-1e308", "beyond every robot cell"),
         ("q1_rad", "1e300", "beyond every joint"),
-        ("qx", "1e308", "beyond every number that a cell has"),
+        ("qx", "1e308", "beyond every number of a cell"),
     ],
 )
 def test_a_number_that_no_cell_has_is_named_by_its_column(column, value, words, tmp_path):
@@ -173,7 +173,7 @@ def session_with(**cells):
     )
 
 
-def test_loads_are_read_and_nothing_is_no_load():
+def test_loads_are_read_and_an_empty_cell_is_no_load():
     view = session_with(payload_kg="5", payload_z_m="0.1", force_z_n="-20").views[0]
     loads = loads_of([view.numbers, {}], ["+", ""])
     assert loads.payload_kg.tolist() == [5.0, 0.0]
@@ -193,7 +193,7 @@ def test_loads_are_read_and_nothing_is_no_load():
         ({"approach": "up"}, "column approach: 'up' must be a side"),
     ],
 )
-def test_what_can_be_no_load_is_refused(cells, words):
+def test_an_impossible_load_is_refused(cells, words):
     raised(DataError, words, session_with, **cells)
 
 

@@ -158,7 +158,7 @@ def test_wrong_views_are_as_wrong_as_promised():
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_poor_motions_are_as_poor_as_they_say(mount):
+def test_poor_motions_are_as_poor_as_named(mount):
     shifted = simulate(exact(CellOptions(mount=mount, views=6, motion="translation")))
     relative = invert(shifted.robot.base_from_flange[:1]) @ shifted.robot.base_from_flange[1:]
     # The inverse kinematics ends at machine precision or a little above it.

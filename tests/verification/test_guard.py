@@ -50,7 +50,7 @@ def white(rows, rng, time_s, factor=1.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_the_rows_of_a_look_are_what_changes_of_the_cell_do_to_it(mount):
+def test_the_rows_of_a_look_are_its_derivatives_by_changes_of_the_cell(mount):
     place = usual(mount)
     guard, cell, at = Guard(place.calibration), place.cell, FITTED + 3
     q, step = cell.robot.joints[at], 1e-6
@@ -262,8 +262,8 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
     far = pose.copy()
     far[:3, 3] *= 1e3
     for changed, words in (
-        ({"cam_from_target": pose}, "one of both"),
-        ({"corners": None}, "one of both"),
+        ({"cam_from_target": pose}, "one of the two"),
+        ({"corners": None}, "one of the two"),
         ({"corners": None, "cam_from_target": far}, "millimetres"),
         ({"base_from_flange": np.eye(3)}, "its shape is"),
         ({"time_s": np.nan}, "time_s is nan, but must be seconds"),
@@ -357,7 +357,7 @@ def lights():
 
 
 @pytest.mark.slow
-def test_turns_are_as_right_as_their_covariance_says(lights):
+def test_turns_are_within_their_covariance(lights):
     """In other light; where parts move; with the camera's offset over a plane."""
     squares, rng = [], np.random.default_rng(0)
     for covered in (0.0, 0.3):

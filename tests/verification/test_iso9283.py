@@ -68,7 +68,7 @@ def test_repeatability_and_accuracy_lie_in_their_intervals(measuring):
     assert "no certificate" not in words
 
 
-def test_what_is_under_the_devices_sigma_is_a_bound(measuring):
+def test_a_figure_under_the_devices_sigma_is_a_bound(measuring):
     found = performance(session_of(shop_of(0.005, np.tile(FIVE[:2], (8, 1)))), measuring)
     assert all(pose.is_bound for pose in found.poses)
     words = " ".join(found.sentences())

@@ -109,7 +109,7 @@ def test_half_of_a_load_is_named_and_hidden_joints_have_no_bounds(unloaded):
     assert "Weigh the loads" in finding.do.words
 
 
-def test_what_is_no_load_is_said(unloaded):
+def test_a_sighting_pushed_aside_under_a_load_is_named(unloaded):
     moved = tracked(replace(SHOP, payloads=FORCES, seed=4), np.repeat(FLAT, 3, axis=0))
     rows = []
     for stop, point, read in moved.rows:
@@ -127,7 +127,7 @@ def test_what_is_no_load_is_said(unloaded):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensated", [True, False])
-def test_the_loads_tell_whether_the_arms_own_weight_bends_it(compensated):
+def test_loads_show_whether_the_arms_weight_bends_it(compensated):
     """Controllers of KUKA and ABB compensate it: its stiffness was once denied there."""
     q = np.repeat(random_postures(arm_named(ARM), 20, np.random.default_rng(5)), 2, axis=0)
     options = replace(SHOP, weight_compensated=compensated, payloads=(Payload(), FORCES[2]), seed=5)

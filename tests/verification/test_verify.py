@@ -240,7 +240,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_change_is_told_with_its_size(place, name):
+def test_a_change_is_reported_with_its_size(place, name):
     change, expected, true, words = CHANGES[name]
     found = checked(place, np.random.default_rng(1), change)
     assert names(found) == expected
@@ -275,7 +275,7 @@ def test_a_board_that_was_placed_anew_is_no_fault(place):
     assert names(slipped) == ["joint 3"]
 
 
-def test_what_no_stops_can_tell_apart_is_named_together(place):
+def test_changes_that_no_stop_separates_are_named_together(place):
     rng = np.random.default_rng(3)
     # A slip of the first joint turns all that stands in the base; of the last, what is carried.
     first = checked(place, rng, slip(1, 0.05))
@@ -289,7 +289,7 @@ def test_what_no_stops_can_tell_apart_is_named_together(place):
     assert "1 stop cannot separate that from" in verdict_of(found).reasons[1]
 
 
-def test_a_view_at_another_pose_than_is_written_beside_it_is_told(place):
+def test_a_view_at_another_pose_than_its_row_states_is_reported(place):
     cell = again(place.cell, np.random.default_rng(6))
     joints = cell.robot.joints.copy()
     joints[2] += 0.02
@@ -397,7 +397,7 @@ def recovered(either, change, rng, causes=None):
     + [slow(kind, mount) for kind in ("camera", "board", "joint 3") for mount in MOUNTS],
     indirect=["either"],
 )
-def test_what_changed_is_estimated_with_its_covariance_and_the_rest_is_kept(either, kind):
+def test_a_change_is_estimated_with_its_covariance_and_the_rest_is_kept(either, kind):
     rng, old, squares = np.random.default_rng(7), either.calibration, []
     (x, z), q = either.cell.transforms.values(), either.cell.robot.joints
     for _ in range(3):

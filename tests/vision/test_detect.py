@@ -120,7 +120,7 @@ def test_a_board_that_the_image_cuts_needs_no_thorough_search(charuco, monkeypat
     assert searches == [True, True, True, False]
 
 
-def test_markers_alone(charuco):
+def test_lone_markers_are_found(charuco):
     _, images = charuco
     target = Target("m", "marker", 1, 1, 0.022, 1e-5, dictionary="DICT_5X5_100", marker_id=3)
     assert find_target(images[0], target).px.shape == (4, 2)
@@ -574,7 +574,7 @@ def test_a_grid_of_circles_leaves_no_row_of_the_plate_over(turns):
 
 
 @pytest.mark.parametrize("asymmetric", [False, True])
-def test_a_blob_that_continues_a_grid_of_circles_is_none_of_it(asymmetric):
+def test_a_blob_that_continues_a_grid_of_circles_is_not_part_of_it(asymmetric):
     """A screw where the next circle would be."""
     board = circles(7, 6, asymmetric=asymmetric)
     places = kind_of(board).corners(board)[:, :2] / board.square_m * 36.0 + 70.0

@@ -216,7 +216,7 @@ def test_a_slanted_label_is_drawn_as_it_is_seen():
     assert found.seen.gauss_px == pytest.approx(np.hypot(0.5, 12**-0.5), abs=0.015)
 
 
-def test_too_little_of_a_print_gives_nothing():
+def test_too_small_a_part_of_a_print_is_not_registered():
     flat, image, pose, _ = view(0, Look())
     outside = pose.copy()
     outside[0, 3] += 2.0

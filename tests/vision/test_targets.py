@@ -443,7 +443,7 @@ DOTS = requested_target(BoardRequest("dots"), pages_named("A4", None))
         slow("tags", "eye-in-hand"),
     ],
 )
-def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
+def test_a_cell_is_calibrated_with_a_rig_of_points(tmp_path, board, mount):
     target = BOARDS.get(board, DOTS)
     seed = 5 if "circles" in board else 4
     cell = simulate(CellOptions(target=target, views=12, mount=mount, seed=seed))
@@ -523,7 +523,7 @@ def dots(tmp_path_factory):
     return load_target(path)
 
 
-def test_a_board_is_what_its_files_say(dots):
+def test_a_board_is_as_its_files_describe_it(dots):
     assert target_from_document(target_document(dots), dots.name) == dots
     assert len(corner_positions(dots)) == 14 * 9
     alike = {"points": {**target_document(dots)["points"], "radius_m": [2e-3] * 126}}

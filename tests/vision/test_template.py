@@ -84,7 +84,7 @@ def test_the_start_may_be_off_by_more_than_a_pixel():
 
 
 @pytest.mark.parametrize("target", [slow(CHECKERBOARD), CHARUCO])
-def test_what_covers_a_corner_leaves_it_to_the_detector(target):
+def test_a_covered_corner_is_left_to_the_detector(target):
     image, truth = photograph(target, replace(SMALL, square_px=40), 1)
     ids = np.arange(len(truth))
     u, v = np.rint(truth[7]).astype(int)
@@ -189,7 +189,7 @@ def test_where_few_corners_are_like_the_print_the_detector_serves(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
-def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
+def test_a_board_that_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
     image, truth = photograph(target, replace(SMALL, square_px=40), 1)
     kind = type(kind_of(target))
     plain = kind.search

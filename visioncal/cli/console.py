@@ -112,7 +112,7 @@ def asked(question: str) -> str:
         raise DataError(
             f"stdin has a line of {len(line)} letters or more.",
             culprits=["stdin"],
-            next_step="Type one answer or pose a line, each ended by Enter.",
+            next_step="Type one answer or pose per line, each ended by Enter.",
         )
     if not line:
         raise EOFError

@@ -99,10 +99,10 @@ class DynamicsRecordOptions:
     is recorded; 2: it is not.
     """
 
-    out: Path = argument("The session's folder; made, or given another stream.")
+    out: Path = argument("The session's folder, which is made or gets another stream.")
     arm: str = option("The arm: ur:HOST.", default=REQUIRED)
     stream: str = option("Name of the recorded stream.", default="excite")
-    robot: str | None = option("Its model; by default what the controller says.")
+    robot: str | None = option("Model of the arm; by default the controller's.")
     rest_s: float = option("The motion ends after this time at rest (s).", default=3.0, min=0.5)
 
 

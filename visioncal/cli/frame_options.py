@@ -32,7 +32,9 @@ from visioncal.core.choices import (
 class FrameOptions(RobotPoseOptions, PartOptions, ActOptions):
     """Source and destination of a frame."""
 
-    touches: Path | None = argument("A table of touches, or a session that shows it.", default=None)
+    touches: Path | None = argument(
+        "A table of touches, or a session with images of it.", default=None
+    )
     calibration: Path | None = option(
         "An output folder, which the frame joins.", "-c", "--calibration"
     )

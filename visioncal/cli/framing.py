@@ -84,7 +84,7 @@ def _place(
     for other in frames:
         if other != name and other.partition("_from_")[2] == child:
             raise DataError(
-                f"{child!r} is taken: {other} is there already.",
+                f"{child!r} is taken: {other} already exists.",
                 culprits=[other],
                 next_step=another.capitalize(),
             )
@@ -235,7 +235,7 @@ def _remove(request: FrameOptions, kind: FrameKind) -> None:
 
 
 def _check_paths(request: FrameOptions, cad: Path | None, needs_tool: bool) -> None:
-    """Names all that is not there where a file is not; raises DataError."""
+    """Names all files that do not exist; raises DataError if there is one."""
     paths = (request.touches, cad, request.calibration)
     absent = [str(path) for path in paths if path is not None and not path.exists()]
     if not absent:
@@ -299,7 +299,7 @@ def fixture_command(options: FixtureOptions) -> None:
             named = drawing or any(read_touches(source, asked, robot, positions=True).kinds)
             others = "" if named else ", nor which points they are: by --cad, or a column kind"
             raise DataError(
-                f"The tool that touched the points is not said{others}.", next_step=NO_TOOL
+                f"The tool that touched the points is not stated{others}.", next_step=NO_TOOL
             )
         tool = _tool(options.tool, calibration, robot)
         rows = read_touches(source, asked, robot, positions=tool is None)

@@ -64,9 +64,9 @@ def guard_command(options: GuardOptions) -> None:
             record_looks(options.recording, answers, f"guard of {calibration.session_name}")
     if not count:
         raise DataError(
-            "no look came on stdin, so that nothing was judged.",
+            "stdin held no look, so nothing was judged.",
             culprits=["stdin"],
-            next_step="Give it a JSON line a look, such as: visioncal guard --example | visioncal "
+            next_step="Write one JSON line per look, as in: visioncal guard --example | visioncal "
             f"guard --against {shlex.quote(str(options.against))}",
         )
     if not guard.holds or is_refused:
@@ -154,7 +154,7 @@ def _look(document: dict[str, Any], targets: Mapping[str, Target]) -> Look:
 
 def _found(path: Path, content: Mapping[str, Any], targets: Mapping[str, Target]) -> Corners:
     if "corners" in content:
-        raise DataError("the look has image and corners, but must have one of both.")
+        raise DataError("the look has image and corners, but must have one of the two.")
     names = [content["target"]] if "target" in content else list(targets)
     if len(names) != 1 or names[0] not in targets:
         known = ", ".join(filter(None, targets)) or "none, or one without a name"

@@ -83,7 +83,7 @@ def history_command(options: HistoryOptions) -> None:
     if options.add:
         found = [entry for out in options.add for entry in _stored(history, out, options.cell)]
         new = history.append(*found)
-        say(f"{new} added, {len(found) - new} were there already")
+        say(f"{new} added, {len(found) - new} existed already")
         return
     if options.cell is not None:
         known = sorted({entry.cell for entry in history.entries()})

@@ -258,8 +258,7 @@ def _plane_of(
     if not name:
         there = some_of(planes) if planes else "none yet; visioncal fixture places them"
         raise DataError(
-            f"--plane is {frame[:80]!r}, and no frame in the base is called that; there are: "
-            f"{there}.",
+            f"--plane is {frame[:80]!r}, but must be a frame in the base: {there}.",
             culprits=["--plane"],
             next_step=did_you_mean(f"{_LEAD}{frame.removeprefix(_LEAD)}", planes)
             or f"A plane is {FORMS}.",
@@ -324,8 +323,8 @@ def _by_image(
         )
     if target is None:
         raise DataError(
-            f"{source} is one image, which does not say what to look for, and the calibration does "
-            "not know one target alone: name it with --target.",
+            f"{source} is one image, which names no target, and the calibration does not have "
+            "exactly one.",
             culprits=["--target"],
             next_step="Name the target; or give --pixel U,V and --plane.",
         )

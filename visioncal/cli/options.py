@@ -142,7 +142,7 @@ class NeedOptions:
 class WorkOptions:
     """How a session is processed, and which drawings are made."""
 
-    threads: int | None = option("Images searched in parallel; else one a core.", min=1)
+    threads: int | None = option("Images searched in parallel; else one per core.", min=1)
     no_report: bool = flag(f"Leave {REPORT} out, which takes a second to draw.")
     no_recording: bool = flag(f"Leave {RECORDING} out, for the viewer.")
     images: ImagesKept = option(

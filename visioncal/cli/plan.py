@@ -259,8 +259,8 @@ def _report(plan: Plan) -> None:
         answer(f"that meets the need, with {len(plan.stops)} stops: {met}")
     if plan.request.start_q is None:
         answer(
-            "the way from where the arm stands to the first stop was not looked at; --start-joints "
-            "says where that is"
+            "the way from where the arm stands to the first stop was not checked; --start-joints "
+            "states that place"
         )
 
 
@@ -336,7 +336,7 @@ def _calibrated(
     else:
         raise DataError(
             f"calibration {calibration.session_name!r} does not say which board it was made with, "
-            "and its recording is not there.",
+            "and its recording is missing.",
             culprits=["--target"],
             next_step="Name the board with --target.",
         )

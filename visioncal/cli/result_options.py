@@ -106,7 +106,7 @@ class BatchOptions(NeedOptions, ActOptions):
     sessions: list[str] | None = argument(
         "Sessions, recordings, their folders, or globs.", default=None
     )
-    workers: int | None = option("Parallel workers, one core each; else one a core.", min=1)
+    workers: int | None = option("Parallel workers, one core each; else one per core.", min=1)
     scheduler: str | None = option(
         "A Dask scheduler, as tcp://HOST:8786 (extra cluster).", metavar="ADDRESS"
     )
@@ -161,9 +161,9 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
     collision: bool = flag("A collision was reported since.")
     most_days: float | None = option("Age beyond which to calibrate again; else 365.", min=0.0)
     most_kelvin: float | None = option(
-        "Change of the ambient temperature beyond which to; else 10 K.", min=0.0
+        "Change of ambient temperature that calls for it; else 10 K.", min=0.0
     )
-    most_kg: float | None = option("Change of the payload beyond which to; else 5 kg.", min=0.0)
+    most_kg: float | None = option("Change of payload that calls for it; else 5 kg.", min=0.0)
     output: Path | None = out_folder(
         f"A folder for {REPORT}, {VERIFY} and a recording.", "-o", "--output"
     )
@@ -233,7 +233,7 @@ class AuditOptions:
     )
     mask: Path | None = option("An image, white where things stand still.")
     against: Path | None = option("A calibration of the camera, for its lens.")
-    looks: int = option("Frames an episode that are compared.", default=4, min=2, max=1000)
+    looks: int = option("Compared frames per episode.", default=4, min=2, max=1000)
     steady_px: float = option(
         "How far images move from look to look without a fault (sigma, px).",
         default=0.1,
@@ -254,7 +254,9 @@ class LoadOptions:
         "Its centre in the flange [m].", form="x,y,z", default="0,0,0", needs="targets"
     )
     temperatures: str | None = option(
-        "Of the links [deg C], for an arm with drift.", metavar="T1,T2,...", needs="targets"
+        "Temperatures of links [deg C]; of an arm with drift.",
+        metavar="T1,T2,...",
+        needs="targets",
     )
 
 

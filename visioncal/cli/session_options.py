@@ -56,7 +56,7 @@ _record_cell = partial(option, panel="The cell, where no plan says it")
 _taking = partial(option, panel="How views are taken")
 _moving = partial(option, panel="How the arm is moved")
 _device = partial(option, panel="What the camera is set to")
-_poses = partial(option, panel="The poses of somebody else's recording")
+_poses = partial(option, panel="The poses of a foreign recording")
 _names = partial(_poses, parse=names_in)
 _recording = partial(option, panel="The recording itself")
 _camera = partial(option, panel="Its camera")
@@ -113,7 +113,7 @@ class SimulateOptions:
     arm_sigma_mm: float = _size("Sigma of the errors of the arm's lengths (mm).")
     arm_sigma_mrad: float = _size("Sigma of the errors of its angles (mrad).")
     wrong_views: int = option("Views whose reported pose is wrong.", default=0, min=0)
-    board_scale: float = option("Printed over stated size.", default=1.0, min=0.5, max=2.0)
+    board_scale: float = option("Printed size over the stated one.", default=1.0, min=0.5, max=2.0)
     with_intrinsics: bool = option("Whether the session states the lens.", default=True)
     images: bool = option("Whether to render images; else pose pairs.", default=True)
     sweep: bool = option("A sweep without stops, by two clocks: pose pairs.", default=False)
@@ -131,7 +131,9 @@ class SimulateOptions:
     torques: bool = flag("Streams of a moving arm's torques; without views, but for a whole cell.")
     touches: bool = flag("Also touches of a tool and a fixture by every robot, in touches.csv ...")
     depth: bool = flag("Also depth pictures, by a sensor that is off as follows.")
-    depth_scale: float = option("Measured over true depth.", default=1.008, min=0.5, max=2.0)
+    depth_scale: float = option(
+        "Measured over true depth (factor).", default=1.008, min=0.5, max=2.0
+    )
     depth_offset_mm: float = option("Offset of depth (mm).", default=-2.5)
     depth_bowl_mm: float = option("How much deeper it is at the sides (mm).", default=4.0)
     depth_box: bool = flag("A box stands before the board in half of the depth pictures.")
@@ -375,7 +377,7 @@ class ConvertOptions(RobotPoseOptions):
     """
 
     first: ClassVar = "target mount images robot_form robot_model intrinsics guess yes force"
-    source: Path = argument("A session's folder, its .rrd, or somebody else's file or folder.")
+    source: Path = argument("A session's folder, its .rrd, or a foreign file or folder.")
     dest: Path = argument("An .rrd, or the folder to write.")
     form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")
     mount: Mount | None = _recording("Where the camera is, or that it is an instrument.")

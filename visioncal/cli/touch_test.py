@@ -59,7 +59,7 @@ def touch_test_command(options: TouchTestOptions) -> None:
     loaded = _looked(options.session, result)
     touching = _touching(result, calibration, options.tool)
     misplaced_mm = None if options.tool == "none" else options.clearance_mm
-    step = "Leave it out." if options.tool else "Say --tool none, too, or leave it out."
+    step = "Leave it out." if options.tool else "Give --tool none, too, or leave it out."
     refuse_given({"--clearance-mm": misplaced_mm}, "it is for --tool none", step)
     with shown_progress(quiet=options.as_json):
         clearance_m = None if options.clearance_mm is None else 1e-3 * options.clearance_mm
@@ -117,7 +117,7 @@ def _looked(path: Path, result: Calibration) -> Session:
     data, known = read_bytes(path, MOST_IMAGE_BYTES), known_targets(result)
     if len(known) != 1:
         raise DataError(
-            f"{path} is one image, and the calibration does not know one board alone.",
+            f"{path} is one image, and the calibration does not have exactly one board.",
             culprits=[str(path)],
             next_step="Name a session of this image, whose session.toml names the board.",
         )

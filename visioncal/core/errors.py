@@ -60,7 +60,7 @@ class ConvergenceError(VisioncalError):
 
 
 class VerdictError(VisioncalError):
-    """A result is there, but its verdict is bad: find the cause, or use it knowingly (--force)."""
+    """A result exists, but its verdict is bad: find the cause, or use it knowingly (--force)."""
 
 
 class DriverError(VisioncalError):

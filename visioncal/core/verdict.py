@@ -141,7 +141,7 @@ class Finding:
 
     @property
     def reason(self) -> str:
-        """Its text and advice."""
+        """The finding's text and advice."""
         return self.words if self.do is None else f"{self.words} {self.do}"
 
 

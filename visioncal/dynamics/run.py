@@ -98,7 +98,7 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
     if not names:
         raise DataError(
             f"session {session.name!r}: {request.validate_on} is its only stream of torques, and "
-            "a fit does not prove itself.",
+            "a fit cannot be validated by its own data.",
             culprits=[request.validate_on],
             next_step="Leave --validate-on out: then the end of the motion is predicted.",
         )

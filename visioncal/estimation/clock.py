@@ -248,7 +248,7 @@ def _tested_change(
 def _own_offsets(
     robot: Trajectory, frames: ImageTimes, fit: ClockFit
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Some frames (m,), the change of the offset that each alone would have [s], its information.
+    """Frames (m,), the change of the offset that each alone would have [s], and its information.
 
     Frames that no offset explains have no information.
     """

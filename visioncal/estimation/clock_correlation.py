@@ -39,7 +39,7 @@ class ImageTimes:
         return len(self.stamps_s)
 
     def only(self, chosen: Mask | IntArray) -> "ImageTimes":
-        """Returns some of the views, in ascending order."""
+        """Selects views, in ascending order."""
         stack, rows = self.stack, np.arange(len(self))[chosen]
         kept = None if stack is None else stack.keep(np.isin(stack.view_of, rows))
         return replace(chosen_rows(self, chosen), stack=kept)

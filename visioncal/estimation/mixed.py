@@ -106,7 +106,7 @@ class SizePrior:
         )
 
     def at(self, logs: FloatArray) -> LikelihoodValue:
-        """Its negative logarithm."""
+        """The prior's negative logarithm."""
         offset = self.jacobian @ logs - self.mean
         return LikelihoodValue(
             0.5 * float(offset @ offset), offset @ self.jacobian, self.jacobian.T @ self.jacobian

@@ -129,7 +129,7 @@ def creep_effects(problem: Problem) -> tuple[Creep, ...]:
 
 
 def still_frames(problem: Problem, frames: Iterable[str]) -> list[str]:
-    """Those of some frames that do not creep: nothing creeps evenly, and the rest is no move."""
+    """Frames among some that do not creep: no move is searched in one that creeps."""
     crept = {effect.frame for effect in creep_effects(problem)}
     return [name for name in frames if name.partition("@")[0] not in crept]
 

@@ -101,7 +101,7 @@ class _Rest:
         self.log = half_squares - 0.5 * float(np.linalg.slogdet(scaled)[1])
 
     def with_free(self, direction: FloatArray, prior: float) -> tuple[float, float, float]:
-        """With a step along a direction, too: log evidence, the step and its sigma."""
+        """Log evidence with a step along a direction, the step and its sigma."""
         by_step = self._information @ direction
         beside = self._covariance @ by_step
         weight = float(direction @ by_step - by_step @ beside)

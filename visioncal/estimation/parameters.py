@@ -33,7 +33,7 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """Its name with its unit."""
+        """Name of the parameter with its unit."""
         if self.kind == "ratio":
             return self.kind
         return f"{self.kind}_{'m' if self.is_length else 'rad'}"
@@ -44,7 +44,7 @@ class Parameter:
         return LEVER_M if self.is_length else 1.0
 
     def value(self, table: DHTable) -> float:
-        """Its value [rad, m or 1]."""
+        """Value of the parameter [rad, m or 1]."""
         if self.kind in FUNCTION_NAMES:
             return float(table.functions[self.joint, FUNCTION_NAMES.index(self.kind)])
         if self.kind in ("theta", "d"):

@@ -160,7 +160,7 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 
 
 def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
-    """Those that differ from stop to stop."""
+    """Candidates that differ from stop to stop."""
     yield from of_arms(fit, pairs)
     jitters = [one for one in effects_of_lenses(fit) if isinstance(one, FocusJitter)]
     yield from beside_zooms(fit, scored(fit, jitters))
@@ -188,7 +188,7 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 
 
 def _sags(fit: Fit, pairs: Sequence[Pair], camera: str) -> Iterator[tuple[BoardSags, ...]]:
-    """Those of the only board that a camera sees, where a flange carries it."""
+    """Sags of the only board that a camera sees, where a flange carries it."""
     boards = {pair.names[1] for pair in images_of(pairs, camera)}
     for board in boards if len(boards) == 1 else ():
         flange, edges = fit.cell.tree.branches[board].parent, fit.linearised.values
@@ -232,7 +232,7 @@ def stops_of(fit: Fit, camera: str) -> IntArray:
 
 
 def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
-    """Those that are of arms and their motion."""
+    """Candidates that are effects of arms and their motion."""
     yield from scored(fit, effects_of_arms(fit))
     known = {effect.name for effect in fit.unknowns.effects}
     for effect in tried_effects(fit):
@@ -243,7 +243,7 @@ def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 def scored(
     fit: Fit, effects: Iterable[Effect], flange: str = "", pairs: Sequence[Pair] = ()
 ) -> Iterator[Candidate]:
-    """Those of some effects that are not open yet; of a flange, beside what its arm errs by."""
+    """Candidates of effects that are not open yet; of a flange, given the errors of its arm."""
     known = {effect.name for effect in fit.unknowns.effects}
     found = list[tuple[Effect, float, float, float]]()
     for effect in effects:

@@ -63,7 +63,7 @@ class Candidates:
         return type(self)(self.poses[rows], self.turns[rows], self.valid[rows])
 
     def carried(self, before: FloatArray, after: FloatArray) -> Self:
-        """Returns them multiplied by (m or 1, 4, 4) transforms on both sides."""
+        """Multiplies the candidates by (m or 1, 4, 4) transforms on both sides."""
         return replace(self, poses=before[:, None] @ self.poses @ after[:, None])
 
     def distances(self, predicted: FloatArray) -> FloatArray:

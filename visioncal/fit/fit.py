@@ -33,7 +33,7 @@ class LeftOut:
 
     @classmethod
     def of(cls, cell: Cell, found: Iterable[tuple[IntArray, _Deviation]]) -> Self:
-        """Those of a cell's n sightings, of some rows at a time; zeros of rows that are absent."""
+        """Deviations of n sightings, given for some rows at a time; zeros for absent rows."""
         count = len(cell.sightings)
         away, predicted, own = (np.zeros((count, *shape)) for shape in ((6,), (6, 6), (6, 6)))
         for rows, values in found:

@@ -67,7 +67,7 @@ class Products:
         return found
 
     def take(self, mask: Mask) -> "Products":
-        """Those of some sightings."""
+        """The products of the sightings in a mask."""
         return replace(
             self, counts=self.counts[mask], heads=self.heads[mask], squares=self.squares[mask],
             functions=self.functions[mask], pulls=self.pulls[mask], posed=self.posed[mask],
@@ -136,7 +136,7 @@ class Gram:
         return by_all[:, :f], common
 
     def take(self, mask: Mask) -> "Gram":
-        """Some of the sightings."""
+        """The matrices of the sightings in a mask."""
         return replace(
             self,
             rows=self.rows[mask], stops=self.stops[mask], moves=self.moves[mask],
@@ -182,7 +182,7 @@ def predicted(
         edge = edge @ moved
         before, back = back, back @ (edge if step.is_up else invert(edge))
         slope = -adjoint(back) if step.is_up else adjoint(before)
-        # Twists that are there already and the next ones do not commute.
+        # Twists that exist already and the next ones do not commute.
         by_effects[name] = slope @ np.linalg.inv(inverse_right_jacobian(twist))
         slopes[name] = by_effects[name] if step.robot else slope @ adjoint(invert(moved))
     return Predicted(invert(back), slopes, by_effects)

@@ -117,7 +117,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
 def _in_all_ways(
     one: "Tried", beside: Callable[["Tried"], "Tried"], boards: Sequence["_Board"]
 ) -> "tuple[Tried, list[Judged]]":
-    """One that is tried beside the stops, judged with boards as stated, and of any size."""
+    """A trial given the stops, judged with boards as stated, and with boards of any size."""
     seen, sizes = beside(one), (0.0, *_LOOSE) if boards else (0.0,)
     return seen, [judged(seen, boards, size) for size in sizes]
 
@@ -186,7 +186,7 @@ def scored(
         return seen.prior + shares + [value for value, *_ in found], gains
 
     def logs_of(each: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """With no effect, and with each: an effect may explain what else takes errors that last."""
+        """Logarithms with no effect, and with each, which may explain errors that last."""
         logs, gains = each
         return np.append(logs, logs[:, None] + gains[0].max(axis=2))
 
@@ -322,7 +322,7 @@ def _by_groups(
 
 
 def _evidence(one: Tried, rows: FloatArray, shared: "Shared") -> tuple[Tried, float]:
-    """One that is tried beside more stops, and the logarithm of its evidence, boards as stated."""
+    """A trial given more stops, and the logarithm of its evidence, with boards as stated."""
     seen = one.beside(rows, shared)
     return seen, seen.prior + judged(seen, (), 0.0)[0]
 

@@ -130,7 +130,7 @@ def _best_of_many(
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Of c more columns with all rows, weighted."""
+    """Weighted products of c more columns with all rows."""
 
     pull: FloatArray  # (c,) with the residuals.
     own: FloatArray  # (c, c) with each other.
@@ -139,7 +139,7 @@ class Products:
 
 
 def products(fit: Fit, added: Iterable[Added], count: int) -> Products:
-    """Those of `count` more columns."""
+    """Weighted products of `count` more columns with all rows."""
     p = fit.unknowns.count
     pull, own, with_common = np.zeros(count), np.zeros((count, count)), np.zeros((p, count))
     with_errors = [np.zeros((len(body.stops), body.width, count)) for body in fit.mixed.bodies]

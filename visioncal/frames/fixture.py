@@ -273,7 +273,7 @@ def touched_fixture(
     """
     if drawing is None:
         rows = rows.of_kinds(
-            FEATURE_KINDS, hint="Say --cad FILE, where the points are those of a drawing."
+            FEATURE_KINDS, hint="Give --cad FILE, where the points are those of a drawing."
         )
     else:
         rows = rows.of_kinds(
@@ -286,7 +286,7 @@ def touched_fixture(
         if unnamed:
             where = rows.source if len(unnamed) == len(rows) else some_of(unnamed)
             raise DataError(
-                f"{where}: which point was touched is not said.",
+                f"{where}: the touched point is not named.",
                 culprits=[where],
                 next_step="Give a column point, with the names that the drawing has.",
             )

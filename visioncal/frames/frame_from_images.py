@@ -110,7 +110,7 @@ def seen_frame(
                 f"{figure(alternative.rms_mm)} mm against the {elsewhere}: it is on a {other}, not "
                 f"on a {kind}.",
                 culprits=[shown.source],
-                next_step=f"Say visioncal {_COMMANDS[other]} for it.{lying * (other == 'tool')}",
+                next_step=f"Run visioncal {_COMMANDS[other]} instead.{lying * (other == 'tool')}",
             )
     own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
     advice = (

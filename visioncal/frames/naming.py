@@ -25,12 +25,12 @@ def transform_name(kind: FrameKind, name: str | None) -> str:
             f"{name[:60]!r} cannot name a {kind}: up to 40 small letters, digits and _ are needed, "
             "a letter first.",
             culprits=[name[:60]],
-            next_step=f"Say --name {kind}_2, or the like.",
+            next_step=f"Give --name {kind}_2, or the like.",
         )
     if name in _TAKEN:
         raise DataError(
             f"{name!r} cannot name a {kind}: every cell has a frame of that name.",
             culprits=[name],
-            next_step=f"Say --name {kind}_{name}, or the like.",
+            next_step=f"Give --name {kind}_{name}, or the like.",
         )
     return f"{PARENTS[kind]}_from_{name}"

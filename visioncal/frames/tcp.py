@@ -137,7 +137,7 @@ def touched_tool(
 
 
 def _other_reading(touches: Touches, numbers: PoseNumbers | None, limit_m: float) -> Finding | None:
-    """The finding that rotations are in another form, by which all touches agree; None without."""
+    """The finding that rotations are in another form, by which all touches agree, if any."""
     declared_m = scatter_m(touches)
     # Poses by joint angles are in none.
     is_read = numbers is not None and np.array_equal(numbers.poses(), touches.base_from_flange)
@@ -161,7 +161,8 @@ def _other_reading(touches: Touches, numbers: PoseNumbers | None, limit_m: float
         f"form, {some_of(rivals, 3)}; and to {figure(1e3 * declared_m)} mm as they are read."
     )
     remedy = Remedy(
-        "Look up what the controller writes, and say it.", f"{AGAIN} --robot-form {rivals[0]}"
+        "Look up the controller's form, and state it.",
+        f"{AGAIN} --robot-form {rivals[0]}",
     )
     return Finding("other_reading", words, remedy, is_fatal=True)
 

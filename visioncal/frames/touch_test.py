@@ -145,7 +145,7 @@ def evaluate_gaps(
     if len(gaps_mm) != len(points) or not all(0.0 <= gap < np.inf for gap in gaps_mm):
         raise DataError(
             f"touch-test: the gaps are {', '.join(f'{gap:g}' for gap in gaps_mm)} mm, but must be "
-            f"{len(points)} of 0 mm or more, one a point.",
+            f"{len(points)} of 0 mm or more, one per point.",
             culprits=["--gaps-mm"],
             next_step="Give them in the order of the points, without sign (149.9 mm beside a block "
             "of 150 mm are 0.1), as --gaps-mm 0.2,0.1,0.3,0.2,0.2.",

@@ -148,7 +148,7 @@ def check_lengths(rows: TouchRows) -> None:
             f"{rows.places[far[0]]}: its position is {distances[far[0]]:.4g} m from the base, and "
             f"no arm reaches {FAR_M:g} m: these look like millimetres.",
             culprits=[rows.places[index] for index in far],
-            next_step="Say --robot-unit mm, or write metres.",
+            next_step="Give --robot-unit mm, or write metres.",
         )
     farthest = float(np.max(distances, initial=0.0, where=np.isfinite(distances)))
     # No arm works within 20 mm of its base's origin.
@@ -157,7 +157,7 @@ def check_lengths(rows: TouchRows) -> None:
             f"{rows.source}: all positions are within {figure(1e3 * farthest)} mm of the base's "
             "origin, where no arm works: these look like metres read as millimetres.",
             culprits=[rows.source],
-            next_step="Say --robot-unit m, or write millimetres.",
+            next_step="Give --robot-unit m, or write millimetres.",
         )
 
 
@@ -169,8 +169,8 @@ def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
     if len(first):
         names = [places[first[0]], places[second[0]]]
         raise DataError(
-            f"{names[0]} and {names[1]} have the very same pose: one is a copy, and would count as "
-            "a touch of its own.",
+            f"{names[0]} and {names[1]} have the same pose: one is a copy, and would count as a "
+            "touch of its own.",
             culprits=names,
             next_step="Leave one of them out, or touch again and write down where the robot is.",
         )
@@ -198,7 +198,7 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
             f"{rows.places[wide[0]]}: a joint stands at {largest[wide[0]]:.4g} rad, more than two "
             "turns: these look like degrees.",
             culprits=[rows.places[index] for index in wide],
-            next_step="Say --joint-unit deg, or write radians.",
+            next_step="Give --joint-unit deg, or write radians.",
         )
     if robot is None:
         if needed and has_joints.any():
@@ -257,7 +257,7 @@ class Tool:
             raise DataError(
                 f"{source} {state}, but must have the one that the points were touched with.",
                 culprits=list(tools) or [source],
-                next_step=f"Say --tool {next(iter(tools))}, or the like." if tools else NO_TOOL,
+                next_step=f"Give --tool {next(iter(tools))}, or the like." if tools else NO_TOOL,
             )
         full = name if name in tools else f"flange_from_{name}"
         if full not in tools:

@@ -117,7 +117,7 @@ class Moments:
         )
 
     def take(self, stops: IntArray) -> Self:
-        """Some of them, in an order."""
+        """The moments at the given indices, in their order."""
         return type(self)(
             {name: poses[stops] for name, poses in self.poses.items()},
             {name: joints[stops] for name, joints in self.joints.items()},

@@ -79,7 +79,7 @@ class Sighting:
 
     @property
     def corners(self) -> Corners | None:
-        """Its corners, if it is an image."""
+        """Corners of the image; None for other sightings."""
         return self.evidence if isinstance(self.evidence, Corners) else None
 
     @property

@@ -64,7 +64,7 @@ class Box:
 
     @property
     def body(self) -> Body:
-        """It as a body that is fixed to the base."""
+        """The box as a body that is fixed to the base."""
         return Body(self.name, 0, "box", self.size_m, self.base_from_box)
 
 

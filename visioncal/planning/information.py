@@ -102,7 +102,7 @@ class World:
     gradient: FloatArray
 
     def of_candidates(self, rows: IntArray) -> "World":
-        """Returns the same world with some of the candidates."""
+        """Returns the same world with the given candidates."""
         return replace(self, factors=self.factors[rows], unestimated=self.unestimated[rows])
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:

@@ -130,21 +130,21 @@ def ur_program(
         named: A sentence that names the cell.
         stops: The stops in driving order.
         act: Says what a person does at a stop.
-        begins: Whether the way from where the arm stands was looked at.
+        begins: Whether the way from where the arm stands was checked.
     """
     start: tuple[str, ...] = ()
     if not has_ur_axes(robot):
         return ""
     if not begins:
         start = (
-            "# The way from where the arm stands now to the first stop was not looked at: bring it",
+            "# The way from where the arm stands now to the first stop was not checked: bring it",
             "# there by hand first.",
         )
     lines = [
         f"# visioncal {__version__}: {len(stops)} stops for {purpose}",
         f"# {one_line(named).encode('ascii', 'replace').decode()}",
         "# Look at plan.rrd first, then run it at reduced speed, with a hand on the stop button.",
-        "# The ways were looked at with capsules for the arm and with what was declared of the",
+        "# The ways were checked with capsules for the arm and with what was declared of the",
         "# cell: floor, boxes, board, camera. Cables, grippers and people are not known to it.",
         *start,
         "# At each stop the program waits: do what it asks for, write down the pose.",

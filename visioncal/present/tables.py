@@ -65,7 +65,7 @@ class Table:
         )
 
     def parts(self, count: int) -> Iterator["Table"]:
-        """Its rows split into at most `count` tables, to stand side by side."""
+        """Splits the rows into at most `count` tables, to stand side by side."""
         size = max(-(-len(self.rows) // count), 1)
         for start in range(0, len(self.rows), size):
             yield replace(self, rows=self.rows[start : start + size])

@@ -23,7 +23,7 @@ class DepthCamera:
 
     @property
     def camera(self) -> Camera:
-        """Its intrinsics."""
+        """Intrinsics of the depth camera."""
         return Camera(self.model, self.resolution, self.matrix, self.distortion)
 
 

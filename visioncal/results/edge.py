@@ -58,22 +58,22 @@ class Edge(PoseSigmas):
 
     @property
     def sigma_words(self) -> str:
-        """Its sigmas in words."""
+        """The transform's sigmas in words."""
         turned = f" and {sigma_words(self.sigma_deg, 'deg')}" if self.oriented else ""
         return f"sigma {sigma_words(self.sigma_mm, 'mm')}{turned}"
 
     def place_words(self, decimals: int = 2) -> str:
-        """Its translation in words, in millimetres with `decimals` decimals."""
+        """The translation in words, in millimetres with `decimals` decimals."""
         x, y, z = (f"{1e3 * value:.{decimals}f}" for value in self.transform.translation)
         return f"({x}, {y}, {z}) mm"
 
     def rotation_words(self, controller: PoseNotation | None = None) -> str:
-        """Its rotation in words, by `rotations`."""
+        """The rotation in words, by `rotations`."""
         forms = (f"{name} ({numbers}) {unit}" for name, numbers, unit in self.rotations(controller))
         return ", ".join(map(str.strip, forms)) if self.oriented else "rotation not measured"
 
     def rotations(self, controller: PoseNotation | None = None) -> Iterator[tuple[str, str, str]]:
-        """Its rotation vector, and its rotation as a robot's controller states it.
+        """The rotation vector, and the rotation as a robot's controller states it.
 
         Yields:
             Name of the form, numbers with commas between, and their unit.

@@ -80,7 +80,7 @@ class Entry:
 
     @property
     def id(self) -> str:
-        """Its identity: of what was found and when, not of where it lies or of which cell it is.
+        """Identifier of the entry, by its result and time, whatever its path and cell.
 
         A result that is added once more, from wherever, is thus the same entry.
         """

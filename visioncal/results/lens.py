@@ -52,7 +52,7 @@ class LensField(Section):
 
     @property
     def levels(self) -> LensLevels:
-        """Its sizes."""
+        """Sizes of the lens's errors."""
         return LensLevels(self.field_px, self.length, self.breathing, self.jitter)
 
 

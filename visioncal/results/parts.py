@@ -102,7 +102,7 @@ class NeedMet:
 
 @dataclass(frozen=True, kw_only=True)
 class CauseForm:
-    """Probable cause why a result is not good."""
+    """Probable cause of a result that is not good."""
 
     cause: str  # Its short, stable name.
     probability: float  # Its probability.

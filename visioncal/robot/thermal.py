@@ -31,7 +31,7 @@ class Inputs:
     ambient_c: FloatArray
 
     def before(self, later: "Inputs") -> "Inputs":
-        """These samples, and later ones after them."""
+        """The samples, followed by later ones."""
         parts = zip(
             (self.stamps_s, self.signal, self.ambient_c),
             (later.stamps_s, later.signal, later.ambient_c),
@@ -298,7 +298,7 @@ class OnlineCompensator:
     @property
     def _now(self) -> FloatArray:
         if self._state is None:
-            raise DataError("thermal: the compensator was fed with no sample yet.")
+            raise DataError("thermal: the compensator has no sample yet.")
         return self._state
 
     @property

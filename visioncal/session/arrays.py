@@ -122,7 +122,7 @@ def _content(
     count, known = len(matrices), [*CellArguments.__annotations__]
     for name in cell.keys() - known:
         raise DataError(
-            f"{name} is nothing that is known of a cell; that is {', '.join(known)}.",
+            f"{name} must be one of {', '.join(known)}.",
             culprits=[name],
             next_step=did_you_mean(name, known),
         )

@@ -89,7 +89,7 @@ def column_of(name: str) -> Column:
             "and not in kelvin"
         )
         return Column(name, -60.0, 200.0, words.format)
-    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is beyond every number that a cell has"))
+    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is beyond every number of a cell"))
     return Column(name, -most, most, words.format)
 
 

@@ -104,7 +104,7 @@ def parse_corners(text: str) -> CornerTable:
         there = f"its columns are {', '.join(columns)}" if any(columns) else "it is empty"
         raise DataError(
             f"{FILE}, header: {there}; {', '.join(_NEEDED)} are "
-            f"needed, {COLUMN} and {_SIGMA} may be there, and others are not read.",
+            f"needed, {COLUMN} and {_SIGMA} are optional, and others are not read.",
             culprits=[f"{FILE}: {name}" for name in (*missing, *other)],
             next_step=hints[0] if hints else f"Begin {FILE} with the line {','.join(_NEEDED)}.",
         )

@@ -140,7 +140,7 @@ def _form(name: str | None) -> str | None:
 class RobotTable(TableModel):
     """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
 
-    Optional where poses are enough. form: the maker's form of poses, in which results are said.
+    Optional where poses are enough. form: the maker's form of poses, in which results are stated.
     gravity_m_s2: acceleration of gravity in the robot's base, for a base that is not upright.
     """
 

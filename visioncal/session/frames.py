@@ -204,10 +204,10 @@ class _DeclaredTree:
         example = "\n".join(f'{name} = "{places[0]}"' for name in missing)
         among = ", ".join(f'"{place}"' for place in places)
         raise DataError(
-            f"session.toml: it is not said what {some_of(missing)} "
-            f"{'hangs' if len(missing) == 1 else 'hang'} on, and it does not follow from the rest.",
+            f"session.toml: the frame that carries {some_of(missing)} is not stated, and does not "
+            "follow from the rest.",
             culprits=[f"{_WHERE}.{name}" for name in missing],
-            next_step=f"Say it, each by one of {among}:\n[frames]\n{example}",
+            next_step=f"State it, each by one of {among}:\n[frames]\n{example}",
         )
 
     def _inferred_parent(self, frame: str, parents: Mapping[str, str]) -> str | None:

@@ -118,7 +118,7 @@ def _place_inside(path: str, fallback: str) -> str:
 def digest_of(session: "Session") -> str:
     """Computes the SHA-256 digest of a session's canonical content; see `Session.digest`.
 
-    The robot's link dimensions, masses and drives, the form of its poses in which results are said,
+    The robot's link dimensions, masses and drives, the form of poses of its results,
     and the task's need are not part of it.
     """
     paths = sorted({path for view in session.views for path in view.files})

@@ -133,8 +133,7 @@ def choose(
         if part in needs and len(remaining) > 1:
             several = [object_name(name, part) for name in remaining]
             raise DataError(
-                f"{label} has several {part}s ({some_of(several)}), and which is meant is not "
-                "said.",
+                f"{label} has several {part}s ({some_of(several)}), and none is chosen.",
                 culprits=[f"--{part}"],
                 next_step=f"Name one: --{part} {several[0]}.",
             )

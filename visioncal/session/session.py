@@ -277,7 +277,7 @@ class Session:
         return select(self, Choice(camera, robot, target))
 
     def with_weights(self, folder: Path) -> "Session":
-        """With pictures whose hard views are matched by weights in a folder, too."""
+        """A session whose pictures are matched in hard views by the weights of a folder, too."""
         targets = {name: with_weights(one, folder) for name, one in self.targets.items()}
         first = self.target and with_weights(self.target, folder)
         return replace(self, target=first, targets=targets)

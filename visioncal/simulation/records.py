@@ -184,7 +184,9 @@ def cell_session(
             next_step="Leave readout_s out, or write corners: visioncal simulate --no-images.",
         )
     if depth is not None and seen != "images":
-        raise DataError("simulation: depth is beside images.", next_step="Leave --no-images out.")
+        raise DataError(
+            "simulation: depth pictures need images.", next_step="Leave --no-images out."
+        )
     sights = [sight for sight in cell.sights if not sight.is_of_lens or seen != "poses"]
     poses = measured_poses(cell) if seen == "poses" else [None] * len(sights)
     views = {

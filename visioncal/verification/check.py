@@ -45,7 +45,7 @@ class PossibleChange:
 
     @property
     def name(self) -> str:
-        """Its kind and what it is of: `camera`, `board NAME`, `joint 3`, `view 7` ..."""
+        """Kind of the change and its part: `camera`, `board NAME`, `joint 3`, `view 7` ..."""
         return self.cause.name
 
 

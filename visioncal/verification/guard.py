@@ -49,7 +49,7 @@ class Look:
 
     time_s: float  # When it was seen, on any clock that only goes forward [s].
     base_from_flange: FloatArray | None = None  # (4, 4) as the robot reported it.
-    # (4, 4) pose of the target, or its corners in the image: one of both.
+    # (4, 4) pose of the target, or its corners in the image: one of the two.
     cam_from_target: FloatArray | None = None
     corners: Corners | None = None
     joints_rad: FloatArray | None = None  # (n,) joint angles [rad]; a calibrated arm needs them.
@@ -69,7 +69,7 @@ class Look:
                 )
         if (self.cam_from_target is None) == (self.corners is None):
             raise DataError(
-                f"look at {self.time_s:g} s: cam_from_target or corners is needed, one of both.",
+                f"look at {self.time_s:g} s: cam_from_target or corners is needed, one of the two.",
                 culprits=["cam_from_target", "corners"],
                 next_step="Send looks that show the target alone.",
             )

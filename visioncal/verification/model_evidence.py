@@ -83,7 +83,7 @@ class ChangeHypothesis:
 
     @property
     def kind(self) -> str:
-        """Its kind."""
+        """Kind of the hypothesis."""
         return self.name.partition(" ")[0]
 
 

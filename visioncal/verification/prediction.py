@@ -246,7 +246,7 @@ def _other_target(message: str, next_step: str) -> DataError:
 
 
 def _differences(prior: CalibrationPrior, name: str, target: Target) -> list[str]:
-    """In what a target is printed differently than a calibrated one; its size's sigma may be."""
+    """Differences in print between a target and the calibrated one, without its size's sigma."""
     ours, theirs = target_document(prior.targets[name]), target_document(target)
     return [
         "image is of another picture"

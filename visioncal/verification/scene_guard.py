@@ -190,7 +190,7 @@ def scene_looks(
         raise DataError(
             f"guard --scene: {used} images of session {session.name!r} could be compared with an "
             "earlier one of the same pose of the robot, but must be two or more.",
-            next_step="See what is said of each; return to one pose after every job, and take an "
+            next_step="Read the reason for each; return to one pose after every job, and take an "
             "image there.",
         )
 

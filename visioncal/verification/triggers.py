@@ -33,7 +33,7 @@ class Trigger:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Its entry in verify.json; unknown values are absent."""
+        """The trigger's entry in verify.json; unknown values are absent."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 

@@ -74,7 +74,7 @@ class Recording:
 
     @property
     def ends(self) -> "Iterator[Recording]":
-        """Its first and its last rows, where these suffice to compare readings."""
+        """The recording's first and its last rows, where these suffice to compare readings."""
         rows = self.common_rows
         count = int(np.ceil(_END_SHARE * len(rows)))
         if count < FEWEST_STOPS:

@@ -82,7 +82,7 @@ def search_by_half(recording: Recording) -> list[Candidate]:
 
 
 def _row_by_row(recording: Recording, best: Candidate, rows: IntArray) -> Candidate | None:
-    """The reading in which angles that were taken for others are of either kind, row by row.
+    """The reading whose angles are of one of two triples of a rotation, row by row.
 
     Of the two triples of angles of a rotation, each row has the one that the camera confirms. None
     where that closes no chain.
@@ -250,7 +250,7 @@ def _of_another_size(
 
 
 def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray | None:
-    """Of rivals of each pose of a target those that turn from view to view as the robot does.
+    """Chooses the rivals of a target's poses that turn from view to view as the robot does.
 
     Args:
         robot: (m, 3, 3) rotations of the robot.

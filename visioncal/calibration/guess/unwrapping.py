@@ -81,7 +81,7 @@ def unwrapped(
 
 
 def in_one_place(positions: FloatArray, camera: FloatArray, mount: Mount) -> IntArray | None:
-    """Of rivals of each pose of a target those by which the robot's positions place what is seen.
+    """Chooses the rivals of a target's poses that agree with the robot's positions.
 
     Args:
         positions: (n, 3) positions of the flange, in any unit and order of axes.

@@ -69,7 +69,9 @@ def connection_advice(frame: str, how: str = "") -> str:
             f"To tie {frame}: let an instrument read points on a robot's flange at 5 stops or "
             "more, or three points that an instrument reads which is tied."
         )
-    look = f"a camera see a board, one of both on {frame} or on its robot and the other one tied,"
+    look = (
+        f"a camera see a board, one of the two on {frame} or on its robot and the other one tied,"
+    )
     if frame.startswith("cam"):
         look = "it see a board that is tied,"
     elif frame.startswith("target"):

@@ -85,8 +85,8 @@ def _not_used(run: RunState) -> Iterator[Finding]:
         yield Finding(
             "unused",
             f"{counted(readings, 'row', ('has', 'have'))} an instrument's readings (meas_ "
-            "columns), which were not used: where images or measured poses (cft_ columns) are "
-            "there, these are.",
+            "columns), which were not used: images or measured poses (cft_ columns) precede "
+            "them.",
             Remedy("Calibrate the arm by the instrument with a session of the readings alone."),
         )
 
@@ -139,7 +139,7 @@ def read_readings(run: RunState) -> RunState:
         if not readings.are_poses:
             if run.solver != "joint":
                 raise DataError(
-                    f"solver {run.solver!r} needs poses, and the instrument reads places alone.",
+                    f"solver {run.solver!r} needs poses, and the instrument reads positions only.",
                     next_step="Leave --solver out.",
                 )
             check_readings(run, readings)

@@ -132,7 +132,7 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
     )
     if state.mount is None and solver != "joint":
         raise DataError(
-            f"solver {solver} cannot be asked of a whole cell: it has the joint solver.",
+            f"solver {solver} is not for a whole cell, which takes the joint solver.",
             culprits=["--solver"],
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )

@@ -183,7 +183,7 @@ def _with_sizes(cell_fit: CellFit, sigmas: Mapping[str, float]) -> CellFit:
 
 
 def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
-    """One solve of the frames by all observations, whose lenses and boards stay as they are."""
+    """Solves the frames once by all observations, with lenses and boards as they are."""
     cell_fit = cell_fit.with_arm_poses()
     if observed.scenes and not cell_fit.inlier_fit.problem.is_combined:
         views = _views_by_camera(observed, cell_fit.poses)

@@ -221,7 +221,7 @@ def _mistyped(
 
 
 def _off(parameter: Parameter, found: FarParameter, table: DHTable, robot: Robot) -> str:
-    """By how much a parameter is off, in words."""
+    """The error of a parameter, in words."""
     stated, size = parameter.value(table), abs(found.change)
     if parameter.kind == "ratio":
         by = f"is off by {figure(100.0 * size)} % (sigma {figure(100.0 * found.sigma)} %)"

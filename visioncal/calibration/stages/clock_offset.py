@@ -204,7 +204,7 @@ def undetermined_error(
             f"from {stamps_s[0]:.6f} to {stamps_s[-1]:.6f} s.",
             culprits=[label, "views.csv: stamp_s"],
             next_step="Write both stamps in seconds, by clocks that differ by seconds at most, or "
-            "state about what they differ by: [clock] camera_minus_robot_s.",
+            "state their approximate difference: [clock] camera_minus_robot_s.",
         )
     return DegenerateError(
         f"clock: the offset between the clocks of camera and robot is left open by {len(views)} "

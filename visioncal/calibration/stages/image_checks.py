@@ -16,7 +16,7 @@ from visioncal.session.selecting import is_whole_cell
 
 
 def missing_images(session: Session) -> Finding | None:
-    """Finding on images that rows name and that are not there."""
+    """Finding on images that rows name and that do not exist."""
     searched = [view for view in session.views if view.image and not view.has_corners]
     missing = [view for view in searched if session.images.absence(view.image) == "is missing"]
     if not missing:

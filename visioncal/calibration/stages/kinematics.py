@@ -116,7 +116,7 @@ class SelectedArmLevel:
 
     @property
     def level(self) -> str:
-        """Its name; `nominal` where no errors explain more than chance."""
+        """Name of the level; `nominal` where no errors explain more than chance."""
         return self.fit.result.level
 
     def left_out(self) -> tuple[UnseenView, ...]:

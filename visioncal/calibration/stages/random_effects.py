@@ -51,7 +51,7 @@ _BY_CHANCE = 0.5 * float(chi2_limit(FALSE_ALARM / 24.0, 6))
 
 
 def of_random_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Those of some effects that are random effects."""
+    """The random effects among some effects."""
     return tuple(effect for effect in effects if effect.name.partition(" of ")[0] in KINDS)
 
 
@@ -136,7 +136,7 @@ def _of_flange(
 def _with_sizes(
     inliers: InlierFit, candidates: Mapping[Effect, float], nuisance: Effect
 ) -> tuple[dict[Effect, float], float]:
-    """Those that the residuals show, with their sizes as priors, and the likelihood with these.
+    """Candidates that the residuals show, with sizes as priors, and the likelihood with these.
 
     Args:
         inliers: The fit.

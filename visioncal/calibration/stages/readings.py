@@ -201,8 +201,8 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
     has_rotations = any(row.instrument_from_probe() is not None for row in rows)
     if instrument.sigma_rad is None and has_rotations:
         raise DataError(
-            f"session.toml: rows have rotations of a probe (meas_qx ...), but how good they are "
-            f"is not known of the instrument {table.name!r}.",
+            f"session.toml: rows have rotations of a probe (meas_qx ...), but their sigma "
+            f"is not known for the instrument {table.name!r}.",
             culprits=["session.toml: instrument.sigma_rad"],
             next_step="State sigma_rad in [instrument], or leave the columns meas_qx ... out.",
         )

@@ -68,7 +68,7 @@ class HeatedStops:
     stamps_s: FloatArray  # (m,) when that was taken [s]; NaN where unknown.
 
     def at(self, rows: IntArray) -> Self:
-        """Returns some of the stops."""
+        """Selects stops by their indices."""
         views, stamps_s = self.views[rows], self.stamps_s[rows]
         return replace(self, q=self.q[rows], views=views, stamps_s=stamps_s)
 

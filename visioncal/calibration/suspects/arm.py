@@ -19,7 +19,7 @@ _LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
     "Name the arm as [robot] model in session.toml, and record its joint angles (q1_rad, ... of "
-    "views.csv) unless they are there: calibrate then estimates the arm, too."
+    "views.csv) unless that is done: calibrate then estimates the arm, too."
 )
 
 

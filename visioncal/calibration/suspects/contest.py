@@ -173,7 +173,7 @@ def _of_growth(run: RunState, kind: str) -> Trial:
 
 
 def _of_board(run: RunState, kind: str) -> Trial:
-    """Of sizes or shapes of boards; of measured poses and exact points, of other distances."""
+    """Trial of sizes or shapes of boards; of other distances for poses and exact points."""
     fit, sized = run.assessment.fit, run.assessment.sized
     if sizes := fit.unknowns.all_of(SIZE):
         return _held(run, fit.unknowns.columns(*sizes))
@@ -190,7 +190,7 @@ def _of_board(run: RunState, kind: str) -> Trial:
 
 
 def _of_lens(run: RunState, _: str) -> Trial:
-    """Of stated lenses that were refined."""
+    """Trial of stated lenses that were refined."""
     fit, optics = run.assessment.fit, run.assessment.fit.camera_parameters
     columns, stated = np.zeros(0, int), np.zeros(0)
     for lens in fit.unknowns.all_of(LENS):

@@ -147,7 +147,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
 
 
 def _misplaced_mm(fitted: Fit, camera: str, px: float) -> float:
-    """By how much so many pixels misplace a thing where the views of a camera looked [mm]."""
+    """Error of a place by an error in pixels, at the distance of a camera's views [mm]."""
     focal_px = float(np.mean(fitted.camera(camera).matrix[:2]))
     return 1e3 * px / focal_px * mean_distance_m(fitted, camera)
 

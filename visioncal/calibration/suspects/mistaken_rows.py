@@ -51,7 +51,7 @@ class Undoing:
 def copied_rows(
     record: Record, edges: Edges, apart: FloatArray, own: IntArray, agrees: Mask
 ) -> Iterator[Undoing]:
-    """Poses of the robot, or of the target, that are there once more though the other moved."""
+    """Poses of the robot, or of the target, that occur twice though the other one moved."""
     closes = apart[agrees].mean() < CLOSING_SCORE**2
     anew, digit = "Record them anew", "to the last digit"
     seen = (

@@ -55,7 +55,7 @@ def _exchanged(
         "moved_frame",
         f"From stop {stop} on, or up to there, {pair[0].frame} and {pair[1].frame} have each "
         f"other's images: each stands where the other stood, to {figure(max(away))} mm of "
-        f"{figure(between_mm)} mm. The result has both as moved.",
+        f"{figure(between_mm)} mm. The result treats both as moved.",
         Remedy(
             f"In views.csv, exchange {names[0]} and {names[1]} in column camera, in the rows of "
             f"the stops from {stop} on or in those before, and calibrate again.",

@@ -301,7 +301,7 @@ def _common_change(
 def _alike(
     inliers: InlierFit, rows: IntArray, frame: str, step: FloatArray
 ) -> tuple[IntArray, tuple[str, FloatArray]]:
-    """Those of some outliers (n,) that a step of a frame explains, and this step by them alone."""
+    """Outliers among (n,) that a step of a frame explains, and this step by them alone."""
     if not frame:
         return rows, (frame, step)
     every, state = np.arange(len(inliers.problem)), inliers.fit.state

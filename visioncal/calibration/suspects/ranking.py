@@ -43,7 +43,7 @@ _LEAST_SHARE = 0.1
 MEASURE_BOARD = Remedy(
     "Measure the board with a caliper over its whole width, and state square_m, the side of one "
     "square (of a marker size_m, its side), and square_sigma_m, how well it is known, of the "
-    "target: more views tell neither."
+    "target: more views determine neither."
 )
 # Error sources of picks: kind of the finding, words, and remedy.
 _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
@@ -57,7 +57,7 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
     "pick": (
         "robot_noise_of_pick",
         "the robot's own noise where it picks, which no calibration changes",
-        Remedy("Take a robot that repeats better, or a gripper that forgives."),
+        Remedy("Take a robot that repeats better, or a gripper that tolerates more."),
     ),
     CONTROLLER: (
         "uncorrected_targets",

@@ -90,12 +90,12 @@ class Record:
 
     @cached_property
     def copies(self) -> Mask:
-        """(m,) views in whose row the robot's pose before is there once more."""
+        """(m,) views whose row repeats the robot's pose of the row before."""
         return _same_as_before(self.robot)[self.rows]
 
     @cached_property
     def lingering(self) -> Mask:
-        """(m,) views in which the pose of the target before is there once more."""
+        """(m,) views that repeat the target's pose of the view before."""
         return _same_as_before(self.camera[:, 0])
 
 

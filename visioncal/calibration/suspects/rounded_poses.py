@@ -51,7 +51,7 @@ def rounded(run: RunState, robot: str, noise_mm: float, noise_deg: float) -> Fin
     return Finding(
         "rounded_poses",
         f"The robot's poses are rounded, their {parts}: this alone puts the flange off by "
-        f"{off} an axis from stop to stop (the fit finds "
+        f"{off} per axis from stop to stop (the fit finds "
         f"{mm_and_deg(noise_mm, noise_deg)}).",
         Remedy(
             "Read the poses from the controller's interface, not from its display, with 0.01 mm "

@@ -65,7 +65,7 @@ class NumberChecks:
         self._wrong.add(row)
 
     def is_sound(self, row: int) -> bool:
-        """Whether no problem of a row is known yet."""
+        """Whether no row has a problem so far."""
         return row not in self._wrong
 
     def filled(self, row: int, name: str) -> bool:

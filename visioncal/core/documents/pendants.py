@@ -129,7 +129,7 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
         raise DataError(
             f"{where}: {line.strip()[:80]!r} must be a pose in a known form.",
             culprits=[where],
-            next_step="Needed is a line as p[x, y, z, rx, ry, rz], {X .., Y .., Z .., A .., B .., "
+            next_step="Write a line such as p[x, y, z, rx, ry, rz], {X .., Y .., Z .., A .., B .., "
             "C ..}, [[x, y, z], [q1, q2, q3, q4]], X .. Y .. Z .. W .. P .. R .., or x_m y_m z_m "
             "qx qy qz qw.",
         )

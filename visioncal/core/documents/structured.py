@@ -87,7 +87,7 @@ class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when import
             if not isinstance(key, yaml.ScalarNode) or key.value in content:
                 place = _place(self.where, key)
                 raise DataError(
-                    f"{place}: {shown(key.value)} must be a key, a word that is there once.",
+                    f"{place}: {shown(key.value)} must be a key that occurs once.",
                     culprits=[place],
                 )
             content[key.value] = self.construct_object(value, deep=True)

@@ -51,8 +51,8 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
             f"{label} is not valid TOML: {error}.",
             culprits=[label],
             next_step=f'{_mended_line(text, str(error))}Text is written in "double quotes", paths '
-            "with /, numbers with a point, lists in [brackets, like, this]; tables and keys are "
-            "there once.",
+            "with /, numbers with a point, lists in [brackets, like, this]; a table or key "
+            "occurs once.",
         ) from error
     except RecursionError as error:
         raise too_deep(label) from error
@@ -99,7 +99,7 @@ def check_values(document: object, label: str, largest: float | None = None) -> 
             )
         elif largest is not None and isinstance(value, float) and not abs(value) <= largest:
             raise DataError(
-                f"{label}: {path} is {value}, but must be a number that a cell has.",
+                f"{label}: {path} is {value}, but must be at most {largest:g} in size.",
                 culprits=[f"{label}: {path}"],
             )
 

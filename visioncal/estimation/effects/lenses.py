@@ -103,7 +103,7 @@ class CameraParameters:
         ).values
 
     def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
-        """Returns them with views reweighted by the residuals of all corners."""
+        """Reweights views by the residuals of all corners."""
         problems = {
             name: replace(corner_problem, stack=corner_problem.stack.weighed(compressed.residuals))
             for (name, corner_problem), compressed in zip(
@@ -124,7 +124,7 @@ class CameraParameters:
         return self._one.positions + self._one.basis @ self.values[self.boards]
 
     def with_values(self, free: IntArray, found: FloatArray) -> "CameraParameters":
-        """Returns them with (f,) other values at given indices."""
+        """Replaces (f,) values at the given indices."""
         values = self.values.copy()
         values[free] = found
         return replace(self, values=values)

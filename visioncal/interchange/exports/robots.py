@@ -138,7 +138,7 @@ def _write_program(what: str, content: Content) -> str:
     """Writes a program that sets UTOOL[n] or UFRAME[n] when it runs; raises DataError without n."""
     if content.number is None:
         raise DataError(
-            f"fanuc-{what.lower()} sets {what}[n] of the controller, and n is not said.",
+            f"fanuc-{what.lower()} sets {what}[n] of the controller, and n is not given.",
             culprits=["--number"],
             next_step="Name it with --number: what stands there is overwritten.",
         )

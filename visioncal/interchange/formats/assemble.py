@@ -129,7 +129,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         raise DataError(
             f"{foreign.name}: how the camera is mounted is not known.",
             culprits=["mount"],
-            next_step="Say --mount eye-in-hand or --mount eye-to-hand"
+            next_step="Give --mount eye-in-hand or --mount eye-to-hand"
             + (f", and {_TARGET}" if lacks_target(foreign) else "."),
         )
     foreign = with_observations_only(foreign)
@@ -191,7 +191,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
 
 
 def _corner_table(foreign: ForeignRecording) -> CornerTable | None:
-    """The corners of a recording by its views' numbers; None without."""
+    """The corners of a recording by its views' numbers; None if it has none."""
     views = foreign.views or range(len(foreign.robot))
     found = [(n, px) for n, px in zip(views, foreign.corners, strict=False) if px is not None]
     return CornerTable.of_lists([(n, np.arange(len(px)), px) for n, px in found]) if found else None
@@ -253,8 +253,8 @@ def unknown_target(foreign: ForeignRecording, culprit: str, then: str = "") -> D
     """The error of images of which nothing says what they show, and what `then` follows."""
     seen, step = _seen_board([image for image in foreign.images if image is not None])
     return DataError(
-        f"{foreign.name}: there are {'images' if foreign.images else 'corners'}, but what target "
-        f"they show is not {seen}.",
+        f"{foreign.name}: there are {'images' if foreign.images else 'corners'}, but their target "
+        f"is not {seen}.",
         culprits=[culprit],
         next_step=f"{step} {_TARGET}{then}",
     )
@@ -266,17 +266,17 @@ def _seen_board(images: Sequence[Path]) -> tuple[str, str]:
     with suppress(DataError):
         seen = identify([read_image(image) for image in some]) if some else None
         if seen is None:
-            return "known", "Say"
+            return "known", "Give"
         is_sure = not seen.is_single or len(seen.marker_ids) < 2
         is_sure &= seen.shown >= min(2, len(some))
         if is_sure and seen.corners_seen >= LEAST_CORNERS * seen.corners:
             return (
-                f"said: a {describe(seen)}",
-                f"Measure the {kind_of(seen.board).side}, write it [mm] in place of 30, and say "
+                f"stated: a {describe(seen)}",
+                f"Measure the {kind_of(seen.board).side}, write it [mm] in place of 30, and give "
                 "--target board.toml, which this makes:\nvisioncal target check "
-                f"{shlex.join(map(str, some))} --square-mm 30 -o board.toml\nElse say",
+                f"{shlex.join(map(str, some))} --square-mm 30 -o board.toml\nElse give",
             )
-    return "known", "Say"
+    return "known", "Give"
 
 
 def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:
@@ -402,7 +402,7 @@ def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) 
                 f"{foreign.name}: {whose} for which size of image they hold, and no image can be "
                 "read.",
                 culprits=["resolution"],
-                next_step="Say --resolution WIDTH,HEIGHT.",
+                next_step="Give --resolution WIDTH,HEIGHT.",
             )
     return lens
 

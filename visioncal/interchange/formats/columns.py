@@ -1,4 +1,4 @@
-"""Tables, JSON and .npz with a row a view; lines of a pendant; a second file of camera poses."""
+"""Tables, JSON and .npz by rows of views; lines of a pendant; a second file of camera poses."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -409,7 +409,7 @@ VIEWS = ForeignFormat(
 )
 TABLE = ForeignFormat(
     "table",
-    "a table, JSON, YAML or .npz with a row a view, alone or in the folder of its images",
+    "a table, JSON, YAML or .npz with one row per view, alone or in the folder of its images",
     # Describes whatever it cannot read.
     Path.exists,
     _read,

@@ -171,7 +171,7 @@ def frames_to_take(
 
 
 def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
-    """Some rows of a recording, in the given order."""
+    """The given rows of a recording, in the given order."""
     views = foreign.views or tuple(range(len(foreign.robot)))
     return replace(
         chosen_rows(replace(foreign, views=views), rows, "notes", "rivals", "makers"),

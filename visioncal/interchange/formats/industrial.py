@@ -218,7 +218,7 @@ def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | N
 
 
 def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
-    """Reads kinematic measurements: cam_from_target with the joints of either chain."""
+    """Reads kinematic measurements: cam_from_target with the joints of one chain."""
     file = _kinematic_file(path) or path
     document = mapping(read_yaml(file), str(file))
     fields = fields_of_document(document, file)

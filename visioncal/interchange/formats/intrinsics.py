@@ -191,7 +191,7 @@ def intrinsics_from(
 
 
 def _coefficients(content: Mapping[str, Any], where: str) -> list[float]:
-    """Coefficients of the distortion, in a list or by their names; none where none are there."""
+    """Coefficients of the distortion, in a list or by their names; empty without any."""
     key = _named(content, _DISTORTION_KEYS)
     found = content if key is None else content[key]
     written = _plain(found) if isinstance(found, Mapping) else {}

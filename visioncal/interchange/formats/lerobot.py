@@ -258,7 +258,7 @@ def _camera_of(source: Path, info: _Info, key: str | None) -> str:
 def episode_frames(
     source: Path, key: str | None
 ) -> dict[int, tuple[int, Callable[[int], bytes], float]]:
-    """Of each episode of a data set: the number of frames, the file of each, and frames a second.
+    """Number of frames, file of each, and frames per second, by episode of a data set.
 
     Raises:
         DataError: The data set cannot be read, or has no such images.

@@ -302,8 +302,8 @@ def _instrument(
         if name:
             step = "Or say its sigma in mm, as --instrument 0.02."
             known_name("instrument", name, known_instruments(), next_step=step)
-        step = "Say --instrument NAME, or its sigma in mm, or add [instrument] to session.toml."
-        return found, () if found else (f"How good the readings are is not said. {step}",)
+        step = "Give --instrument NAME, or its sigma in mm, or add [instrument] to session.toml."
+        return found, () if found else (f"The sigma of the readings is not stated. {step}",)
     places = next(iter(points.points().values()), ())
     unit = Heading.of(names[0]).unit or points.unit(places, requested.camera.unit)[0]
     text = "\n".join((*names, points.title))

@@ -132,7 +132,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         raise DataError(
             f"Each row has several images: {some_of([group.listed() for group in rivals])}.",
             culprits=[group.label for group in rivals],
-            next_step=f"Say --images {shlex.quote(str(rivals[0].files[0]))}, or the first file of "
+            next_step=f"Give --images {shlex.quote(str(rivals[0].files[0]))}, or the first file of "
             "the others.",
         )
     (chosen, match), how = ranked[0], ranked[0][1].how

@@ -115,7 +115,7 @@ def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
         raise DataError(
             f"{', '.join(names)} are not {form.words}, the form of this robot's poses.",
             culprits=names,
-            next_step=f"Say whose they are, as --robot-form {makers[0]}.",
+            next_step=f"Name their maker, as --robot-form {makers[0]}.",
         )
     fits = len(names) == 3 + ROTATION_FORMS[form.rotation].size
     fits &= {*units[3:]} <= {"", *(DEGREES if form.rotation.endswith("-deg") else ("rad",))}
@@ -145,12 +145,12 @@ def check_radians(
         if form.models and form.rotation.endswith("-deg"):
             makers[form.words.partition("Z, ")[2]].append(form.name)
     listed = (f"{' or '.join(forms)} for {names}" for names, forms in makers.items())
-    next_step = f"Say --{whose}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
+    next_step = f"Give --{whose}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
     if requested.form is not None:
         needed = f"poses of the form {requested.form} are in radians"
         degrees = f"{rotation.removesuffix('-rad')}-deg"
         degrees = f"{requested.form}-deg" if f"{requested.form}-deg" in POSE_FORMS else degrees
-        next_step = f"Say --{whose}-form {degrees}, where these are degrees"
+        next_step = f"Give --{whose}-form {degrees}, where these are degrees"
     raise DataError(
         f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
         f"{size}, and {needed}.",

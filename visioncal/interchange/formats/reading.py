@@ -297,7 +297,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
         raise
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
         raise DataError(
-            f"{path} is one 4 x 4 matrix, but must have a row a view, or be a file a view.",
+            f"{path} is one 4 x 4 matrix, but must be one row or one file per view.",
             culprits=[str(path)],
             next_step="Convert the folder.",
         )
@@ -359,7 +359,7 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
         return [counted, *_fields_of_lists([] if holds_pose(counted) else records, path)]
     if not lists:
         raise DataError(
-            f"{path} has no list with one entry a pose"
+            f"{path} has no list with one entry per pose"
             f"{', but names and values alone' if document else ': it is empty'}.",
             culprits=[str(path)],
         )

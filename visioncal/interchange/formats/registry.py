@@ -137,8 +137,8 @@ def convert(
             doubtful = DoubtfulSession.of(replace(foreign, title=dest.resolve().stem))
     elif requested not in (_DEFAULTS, _FREE_LENSES):
         raise DataError(
-            f"{source} is a session already; what describes poses and cameras is for somebody "
-            "else's recording.",
+            f"{source} is a session already; options that describe poses and cameras are for "
+            "foreign recordings.",
             culprits=[str(source)],
             next_step="Edit its session.toml, or convert its views.csv.",
         )
@@ -227,7 +227,7 @@ def write_session(session: Session, dest: Path) -> None:
                 f"session {session.name!r} is not the same when it is read twice, as a damaged "
                 "video or a file that is still being written.",
                 culprits=[session.name],
-                next_step="Nothing was written; take a whole copy of what it is read from.",
+                next_step="Nothing was written; take a complete copy of its source.",
             )
         otherwise.pop_all()
 

@@ -218,7 +218,7 @@ def _tested(
         raise DataError(
             f"{readings[0][1].name}: the camera is not mounted as stated. {others[0].sentence}",
             culprits=["--mount"],
-            next_step=f"Say --mount {others[0].best.hypothesis.mount}.",
+            next_step=f"Give --mount {others[0].best.hypothesis.mount}.",
         )
     if not found:
         return None, why
@@ -368,8 +368,8 @@ def _untested(
     is_armless &= foreign.joints_rad is not None and not foreign.robot.present.any()
     if is_asked and is_armless:
         raise DataError(
-            f"{foreign.name}: there are joint angles and no poses of the robot, and which arm they "
-            "belong to is not said.",
+            f"{foreign.name}: there are joint angles and no poses of the robot, and their arm is "
+            "not stated.",
             culprits=["--robot-model"],
             next_step="Name the arm with --robot-model: a built-in robot, its .urdf or a DH table.",
         )
@@ -384,7 +384,7 @@ def _untested(
 def _unsaid(
     foreign: ForeignRecording, whose: Side, why: str, fault: VisioncalError | None
 ) -> DataError:
-    """The error of a form of rotations that is not said, and what kept the images from telling."""
+    """The error that a form of rotations is not stated, and why images do not determine it."""
     joints = (
         " Where the numbers are joint angles, name them with --joint-columns, and the arm with "
         "--robot-model."
@@ -394,7 +394,7 @@ def _unsaid(
     forms = (
         "quaternion-xyzw, or quaternion-wxyz"
         if size == 4
-        else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or whose they are, as kuka"
+        else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or their maker, as kuka"
     )
     by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
     if whose == "robot" and len(by_names) == 1:
@@ -404,20 +404,20 @@ def _unsaid(
             " What else this reading changes is done to the session that is then written: "
             "visioncal convert SESSION NEW --guess --yes."
         )
-    unsaid = f"the form of the {whose}'s rotations is not said"
+    unsaid = f"the form of the {whose}'s rotations is not stated"
     # A fault of the images comes first: while it lasts, no form helps.
     words = f"{unsaid}, and nothing determines it: {why}"
     step = f"{_MOVE}say" if why.startswith((ONE_AXIS, _STILL)) else "Say"
     if why.startswith(_STILL):
         words = f"{why}. No calibration is determined so, and no form of these rotations"
     elif why.startswith(NO_READING):
-        step = "Look whether these rows are those of these images or poses of the target. Else say"
+        step = "Look whether these rows are those of these images or poses of the target. Else give"
         if foreign.images and foreign.target is None:
             board = "Name the board that the images show with --target: its corners determine more."
             step = f"{board} {step}"
     elif fault is not None:
         words = f"{re.sub('^session .*?: ', '', why)}. Beside that, {unsaid}"
-        step = f"{fault.next_step} Else say".strip()
+        step = f"{fault.next_step} Else give".strip()
     return DataError(
         f"{foreign.name}: {words}.",
         culprits=[*(fault.culprits if fault else ()), f"--{whose}-form"],

@@ -99,7 +99,7 @@ class Source:
         return max((len(each) for part in self.parts for each in part.rows), default=0)
 
     def lens(self) -> tuple[Mapping[str, Any] | None, tuple[str, ...]]:
-        """The only lens, or that of the colour camera, and where it is from; None without."""
+        """The only lens, or the colour camera's, and its origin; None without a lens."""
         found = {place: lens for part in self.parts for place, lens in part.lenses.items()}
         named = {p: lens for p, lens in found.items() if "rgb" in p.lower() or "colo" in p.lower()}
         different = {str(lens): place for place, lens in (named or found).items()}
@@ -110,7 +110,7 @@ class Source:
         return None, (note,) * bool(found)
 
     def board(self) -> tuple[Mapping[str, Any] | None, tuple[str, ...]]:
-        """The only board that a file beside describes, and where it is from; None without."""
+        """The only board that a file beside describes, and its origin; None without a board."""
         found: dict[str, Mapping[str, Any]] = {}
         for file in (part.group.files[0] for part in self.parts if part.group.is_data):
             if file.suffix in _OF_BOARDS and file.stat().st_size < _MOST_OF_BOARD:
@@ -391,8 +391,8 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         culprits=[str(source.path)],
         next_step=step
         or next((part.fault.next_step for part in source.parts if part.fault), "")
-        or "Write the poses into a CSV with a header, a row a view. Lists in a .py or .cpp program "
-        "are read where it is named as the source.",
+        or "Write the poses into a CSV with a header, one row per view. Lists in a .py or .cpp "
+        "program are read where it is named as the source.",
     )
 
 
@@ -432,7 +432,7 @@ def several_recordings(source: Source, requested: ImportOptions) -> DataError | 
 def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] | None:
     """The robot's file and the camera's where two files of poses are as long; None of others.
 
-    The names of the files say whose they are. Raises DataError where they do not.
+    The names of the files say which side each is of. Raises DataError where they do not.
     """
     files = [
         (part.group.files[0], fields)
@@ -464,7 +464,7 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
         )
     raise DataError(
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
-        "whose they are is not said.",
+        "which are the robot's is not stated.",
         culprits=[str(robot), str(camera)],
         next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n{both}",
     )

@@ -138,7 +138,7 @@ def _of_robot(fields: Fields, robot: str | None) -> Fields:
     if robot not in names:
         raise DataError(
             f"{fields.name} has touches of several robots ({some_of(names)}), and "
-            f"{'which is meant is not said' if robot is None else f'none of {robot!r}'}.",
+            f"{'none is chosen' if robot is None else f'none of {robot!r}'}.",
             culprits=["--robot"],
             next_step=did_you_mean(robot or "", names) or f"Name one: --robot {names[0]}.",
         )
@@ -160,8 +160,8 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
     fields = read_fields(path)
     if "qw" in fields.numbers:
         raise DataError(
-            f"{path.name} has rotations (qx to qw), as touched poses have; a drawing has a place a "
-            "point.",
+            f"{path.name} has rotations (qx to qw), as touched poses have; a drawing has one place "
+            "per point.",
             culprits=[str(path)],
             next_step="Name the touches first, and the drawing's table with --cad.",
         )

@@ -48,7 +48,7 @@ class Consent:
                 f"{command}: nobody can be asked whether the arm may move, as stdin is not a "
                 "terminal.",
                 culprits=["--yes"],
-                next_step="Say --yes where the cell is clear and somebody holds the stop button.",
+                next_step="Give --yes where the cell is clear and somebody holds the stop button.",
             )
         return cls(None if yes else ask)
 

@@ -98,7 +98,7 @@ class FolderCamera:
         return self._decoded[1]
 
     def skip(self) -> None:
-        """Counts the pictures that are there as given."""
+        """Counts the present pictures as given."""
         self.given |= {path.name for path in self._folder.glob("*")}
 
     def close(self) -> None:

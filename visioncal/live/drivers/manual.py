@@ -83,7 +83,9 @@ class ManualArm:
                 )
             pose = self._read(line)
             if isinstance(pose, str):
-                raise DriverError(pose, culprits=["stdin"], next_step="Correct it: a pose a line.")
+                raise DriverError(
+                    pose, culprits=["stdin"], next_step="Correct it: one pose per line."
+                )
             return ArmState(time.monotonic(), pose.pose, pose_form=pose.form.name)
         line = self._answer("Pose of the flange: ")
         while True:
@@ -117,7 +119,7 @@ class ManualArm:
         try:
             return self._ask(question)
         except EOFError as error:
-            raise DriverError("The poses that were typed are at their end.") from error
+            raise DriverError("No typed pose is left.") from error
 
 
 def pose_words(pose: FloatArray) -> str:

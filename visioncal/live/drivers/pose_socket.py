@@ -157,7 +157,7 @@ class SocketArm:
     def state(self) -> ArmState:
         """The stop of the last request, stamped now; raises DriverError before the first."""
         if self._stop is None:
-            raise DriverError("The robot's own program has not said where it stands.")
+            raise DriverError("The robot's program has not sent its pose yet.")
         return replace(self._stop, stamp_s=time.monotonic())
 
     def request(self, timeout_s: float, wanted: str = "") -> ArmState | None:  # noqa: ARG002
@@ -243,7 +243,7 @@ class SocketArm:
         if len(parts) not in (1, 2) or not (is_number and 1 <= int(number) <= MOST_VIEWS):
             raise DataError(
                 f"{line[:20]!r} must be a stop.",
-                next_step=f"Needed is: number (1 to {MOST_VIEWS}) | pose, or number | pose | "
+                next_step=f"A stop is: number (1 to {MOST_VIEWS}) | pose, or number | pose | "
                 "joints deg.",
             )
         if self._form is None and len(forms := possible_forms(parts[0])) > 1:
@@ -343,7 +343,7 @@ def _joints(text: str) -> FloatArray:
     if unit not in ("deg", "rad") or not values:
         raise DataError(
             f"{text[:40]!r} are no joint angles.",
-            next_step="Needed are numbers and their unit, as 10.5 -20 30 0 45 90 deg.",
+            next_step="Send numbers and their unit, as 10.5 -20 30 0 45 90 deg.",
         )
     angles = np.array(values)
     angles = np.deg2rad(angles) if unit == "deg" else angles

@@ -135,7 +135,7 @@ class CameraDevice(Protocol):
 
     @property
     def settings(self) -> Mapping[str, str | float]:
-        """Its settings, such as `exposure_us` or `focus`, to be recorded."""
+        """Settings of the camera, such as `exposure_us` or `focus`, to be recorded."""
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call.
@@ -162,10 +162,10 @@ class StoredPictures(CameraDevice, Protocol):
         """
 
     def look(self, name: str) -> Image | str:
-        """Returns one of them without giving it, or says why it is none: `unreadable: ...`."""
+        """Returns a picture without giving it, or why it cannot be read: `unreadable: ...`."""
 
     def skip(self) -> None:
-        """Counts the pictures that are there as given."""
+        """Counts the present pictures as given."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def connect(host: str, port: int, what: str) -> socket.socket:
         link = socket.create_connection((host, port), _CONNECT_S)
     except ConnectionRefusedError as error:
         raise DriverError(
-            f"{host} is there, but its port {port} ({what}) is closed: no UR controller with "
+            f"{host} answers, but its port {port} ({what}) is closed: no UR controller with "
             "PolyScope 3 or 5 is running there.",
             culprits=[f"{host}:{port}"],
             next_step="Check the address; wait until the pendant has started; open the port under "

@@ -34,7 +34,7 @@ class Outcome:
 
     @property
     def report(self) -> Path:
-        """Its page."""
+        """The page of the report."""
         return self.folder / "report.html"
 
     @property

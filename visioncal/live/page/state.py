@@ -41,7 +41,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class PageText:
-    """Questions and words of a page."""
+    """Texts of a page: its questions and its other words."""
 
     title: str
     # Fields of the setup that are asked for, by their names: label, and what may be chosen.

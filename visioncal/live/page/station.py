@@ -257,7 +257,7 @@ class Station:
             self._list_pictures(camera)
 
     def _list_pictures(self, camera: StoredPictures) -> None:
-        """Publishes which pictures of a folder are there, the one that is due first."""
+        """Publishes the names of a folder's pictures, the one that is due first."""
         waiting, left_out = tuple(camera.waiting()), self._capture.journal.left_out
         if (waiting, left_out) != (self.snapshot.waiting, self.snapshot.left_out):
             self._publish(due="".join(waiting[:1]), waiting=waiting, left_out=left_out)
@@ -391,7 +391,7 @@ class Station:
             self._capture.view(*self._capture.next_numbers(), task.count)
 
     def _watch_folder(self) -> None:
-        """Shows the picture of a folder that is due, and which are there."""
+        """Shows the picture of a folder that is due, and the names of all."""
         camera = self._capture.cell.camera
         assert isinstance(camera, StoredPictures)
         self._list_pictures(camera)

@@ -28,7 +28,7 @@ class BoardSags(Displacement):
     def tried(
         cls, camera: str, flange: str, normal: FloatArray, marks: FloatArray
     ) -> "tuple[BoardSags, ...]":
-        """Those of some lines, of a board with (n, 3) corners."""
+        """Sags about four lines of a board with (n, 3) corners."""
         return tuple(cls(camera, flange, normal, marks, at * np.pi / 4.0) for at in range(4))
 
     def bow_m(self, values: FloatArray) -> float:

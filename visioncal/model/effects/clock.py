@@ -11,7 +11,7 @@ from visioncal.model.effects.effect import Effect, Size
 
 @dataclass(frozen=True)
 class Clock(Effect):
-    """By how much the camera's clock is farther ahead of the robot's than was taken [s]."""
+    """Lead of the camera's clock over the robot's beyond the assumed one [s]."""
 
     kind, count = "clock", 1
     clause = "the clocks of robot and camera are apart"

@@ -74,7 +74,7 @@ class Creeps(_Moves, Named):
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
-        """Evenly; as what warms up; as what settles in the first stops."""
+        """Even creep, creep as of warming, and creep that settles in the first stops."""
         del stood
         yield from (cls(flange, rate=rate) for rate in _RATES)
 
@@ -104,7 +104,7 @@ class BaseCreeps(Creeps, _OfBase):
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
-        """As all do, about the base and about what stands in it."""
+        """Creeps about the base, and about what stands in it, of all rates."""
         for place in dict.fromkeys([(), stood.beside_m]):
             yield from (cls(flange, place, rate) for rate in _RATES)
 

@@ -54,12 +54,12 @@ class Effect(ABC):
 
     @property
     def name(self) -> str:
-        """Its name: in sizes, budget and result."""
+        """Name of the effect in sizes, budget and result."""
         return f"{self.kind} {self.frame}"
 
     @property
     def size(self) -> Size:
-        """Its size."""
+        """Size of the effect, with its bounds."""
         return Size(self.name, *self.bounds)
 
     @property
@@ -83,7 +83,7 @@ class Effect(ABC):
 
     @property
     def typical(self) -> "Effect":
-        """One by whose score this one is judged, where it has very many unknowns."""
+        """An effect by whose score this one is judged, where it has very many unknowns."""
         return self
 
     def twists(self, moments: Moments, values: FloatArray) -> FloatArray:
@@ -120,13 +120,13 @@ class Named(ABC):
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
-        """Those that are tried of a flange: none of effects on a lens."""
+        """Effects that are tried on a flange; none where the effect is on a lens."""
         del flange, stood
         return iter(())
 
     @classmethod
     def of_lens(cls, camera: str, lens: Camera, flange: str) -> Iterator[Effect]:
-        """Those that are tried of a lens, on a flange or on none: none of effects on a flange."""
+        """Effects that are tried on a lens; none where the effect is on a flange."""
         del camera, lens, flange
         return iter(())
 

@@ -15,7 +15,7 @@ from visioncal.robot.thermal import Inputs, ThermalModel
 
 @dataclass(frozen=True, eq=False)
 class Heat(Effect):
-    """By how many of their sigmas growth, drift, time constants and gains are other than usual.
+    """Departures of growth, drift, time constants and gains from the usual ones [their sigmas].
 
     See `ThermalModel`. The arm is as stated at the first sample, and at moments without a time as
     warm as at the last one.

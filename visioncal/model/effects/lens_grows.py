@@ -30,7 +30,7 @@ class LensGrows(LensEffect, Named):
 
     @classmethod
     def of_lens(cls, camera: str, lens: Camera, flange: str) -> Iterator[Effect]:
-        """As what warms up; evenly."""
+        """Growth as of a camera that warms up, and even growth."""
         del flange
         for rate in (TIME_CONSTANTS, 0.0):
             yield cls(camera, lens, rate)

@@ -11,7 +11,7 @@ from visioncal.model.effects.joints import JointEffect
 
 @dataclass(frozen=True, eq=False)
 class Play(JointEffect):
-    """By how much each joint's angle differs between both sides of approach [rad].
+    """Difference of each joint's angle between both sides of approach [rad].
 
     Where sides are not known, as of picks, joints are in the middle.
     """

@@ -32,7 +32,7 @@ class Window(Displacement):
 
     @classmethod
     def tried(cls, camera: str) -> "tuple[Window, ...]":
-        """Those of some tilts, in all directions."""
+        """Panes of several tilts, in all directions."""
         tilts, turns = np.deg2rad(np.arange(15.0, 61.0, 15.0)), np.deg2rad(np.arange(0, 360, 30))
         return tuple(
             cls(camera, (np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)))

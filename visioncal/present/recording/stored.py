@@ -151,7 +151,7 @@ class RecordedImages(ImageStore):
 
     def _replaced(self, path: str) -> DataError:
         return DataError(
-            f"{self.path}: the image {path} is not there any more: the recording was changed or "
+            f"{self.path}: the image {path} no longer exists: the recording was changed or "
             "replaced since it was loaded.",
             culprits=[path],
             next_step="Load it again.",

@@ -63,7 +63,7 @@ class FleetRow:
         return "no result" if self.worst is None else self.worst.status
 
     def last(self, *kinds: str) -> Entry | None:
-        """Its last act of some kinds; None where there is none."""
+        """The cell's last act of the given kinds; None without one."""
         return next((entry for entry in reversed(self.entries) if entry.kind in kinds), None)
 
     @property

@@ -86,7 +86,7 @@ class Charuco(Board):
         return np.zeros(2), target.square_m * np.array([target.columns, target.rows], dtype=float)
 
     def cells(self, target: Target) -> tuple[Cells, ...]:
-        """Its dark squares, and the markers in the light ones."""
+        """Dark squares, and the markers in the light ones."""
         light = marked_squares(target)
         dark = np.ones((target.rows, target.columns), dtype=bool)
         dark[light[:, 1], light[:, 0]] = False

@@ -75,7 +75,7 @@ class Checkerboard(Board):
         return np.full(2, -side), side * np.array([target.columns, target.rows], dtype=float)
 
     def cells(self, target: Target) -> tuple[Cells, ...]:
-        """Its squares; that diagonally outside corner 0 is dark."""
+        """Squares of the board; the one diagonally outside corner 0 is dark."""
         row, column = np.indices((target.rows + 1, target.columns + 1))
         side = target.square_m
         return (Cells(np.full(2, -side), side, (row + column) % 2 == 0),)

@@ -105,7 +105,7 @@ class GridBoard(BoardKind):
         return f"{self.noun.removesuffix(' of markers')} of {size} {self.sides}, {numbered}"
 
     def cells(self, target: Target) -> tuple[Cells, ...]:
-        """Its markers."""
+        """Cells of the markers."""
         corners = self.corners(target)[::4, :2]
         return tuple(
             Cells(corner, target.square_m / len(dark), dark)

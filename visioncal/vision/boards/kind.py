@@ -119,7 +119,7 @@ class BoardKind(ABC):
 
     @abstractmethod
     def read(self, table: DocumentTable, name: str) -> Target:
-        """Reads its description; raises DataError."""
+        """Reads the description of a target; raises DataError."""
 
     @abstractmethod
     def corners(self, target: Target) -> FloatArray:
@@ -140,7 +140,7 @@ class BoardKind(ABC):
 
     @abstractmethod
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
-        """Its corners in a (h, w) grey image; see `find_target`."""
+        """Finds the corners in a (h, w) grey image; see `find_target`."""
 
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
         """Refines (n, 2) detected corners [px] with these (n,) ids by the template."""

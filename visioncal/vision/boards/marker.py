@@ -60,7 +60,7 @@ class MarkerKind(BoardKind):
         return f"marker {target.marker_id} of {target.dictionary}"
 
     def cells(self, target: Target) -> tuple[Cells, ...]:
-        """Its modules."""
+        """Modules of the marker."""
         dark = marker_cells(target.dictionary, target.marker_id)
         side = target.square_m
         return (Cells(np.full(2, -0.5 * side), side / len(dark), dark),)

@@ -126,7 +126,7 @@ class Rig(PointsKind):
         return f"target of kind {self.name}"
 
     def cells(self, target: Target) -> tuple[Cells, ...]:
-        """Its tags, at the poses given by their corners."""
+        """Cells of the tags, at the poses given by their corners."""
         ids_of_corners, places = tag_corners(target), self.corners(target)
         if (
             not ids_of_corners

@@ -244,7 +244,7 @@ class Fitter:
         return replace(blank, gain=gain + 2 * bent, residuals=residuals, weights=weights)
 
     def weighed(self, look: Look, slack_px: float) -> Look:
-        """With weights by the residuals: of what covers the print, and of single pixels.
+        """A look with weights by its residuals, for covered areas and for single pixels.
 
         A shift of `slack_px` of this level is no cover yet.
         """
