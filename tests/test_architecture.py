@@ -292,6 +292,8 @@ def test_names_have_the_terms_of_the_field():
 
 
 RELATIVE = re.compile(r"(?:\"\"\"|# )(?:What|Which|That) ")
+# A docstring that begins so has a subject in another one, or none.
+PRONOUN = re.compile(r"\"\"\"(?:As|By|In|It|Its|Of|Theirs?|These|They|Those|With) ")
 
 
 def test_no_docstring_or_comment_begins_with_a_relative_clause():
@@ -299,6 +301,13 @@ def test_no_docstring_or_comment_begins_with_a_relative_clause():
         for at, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             is_heading = '"## What' in line
             assert is_heading or not RELATIVE.search(line), f"{path}:{at}: {line.strip()}"
+            assert not PRONOUN.search(line), f"{path}:{at}: {line.strip()}"
+
+
+def test_no_test_is_named_by_a_relative_clause():
+    for path in sorted((PACKAGE.parent / "tests").rglob("test_*.py")):
+        found = re.findall(r"def (test_(?:what|which|that)_\w+)", path.read_text(encoding="utf-8"))
+        assert not found, (path, found)
 
 
 # A later sentence of a text; questions may begin so.

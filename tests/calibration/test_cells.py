@@ -473,7 +473,7 @@ def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
     with pytest.raises(DegenerateError, match="differ in position only") as caught:
         calibrate(turned(0.0, stops=8, turn_deg=0.0)[1])
     assert caught.value.next_step == (
-        "To tie base_b: let a camera see a board, one of the two on base_b or on its robot, the "
+        "To tie base_b: let a camera see a board, one of the two on base_b or on its robot and the "
         "other one tied, at 5 stops or more, tilted by 20 to 40 degrees about different axes."
     )
 

@@ -47,7 +47,7 @@ class SmallLibraries(Loader):
         return None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """A part that is loaded later."""
+        """Makes a module that is loaded on first use."""
         return _Postponed(spec.name)
 
     def exec_module(self, module: ModuleType) -> None:

@@ -302,7 +302,7 @@ def _result(check: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Checked:
-    """A verify.json as a page shows it."""
+    """Content of a verify.json, as a page shows it."""
 
     passed: bool
     sentences: tuple[str, ...]

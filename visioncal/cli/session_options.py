@@ -297,7 +297,7 @@ class PlanOptions(ClearanceOptions):
     _example: bool = example_flag("plan")
 
     def options(self, *names: str) -> dict[str, object]:
-        """Some options by their names; None for those that were not given."""
+        """Options by their names; None for those that were not given."""
         return {f"--{name}": getattr(self, name) for name in names}
 
 

@@ -61,7 +61,7 @@ class Remedy:
 
     @property
     def of_cell(self) -> "Remedy":
-        """The same for several robots or cameras: by hand where its command takes one of each."""
+        """The remedy for several robots or cameras: by hand where its command takes one of each."""
         if not _OF_ONE.search(self.command):
             return self
         by_hand = "Of several robots or cameras, correct the files by hand."

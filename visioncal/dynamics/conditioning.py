@@ -219,7 +219,7 @@ class Piece:
         return used
 
     def advanced(self, lag_s: float) -> Self:
-        """The same with the torques shifted earlier by a lag [s]."""
+        """The samples with torques shifted earlier by a lag [s]."""
         times_s = self.measured.motion.times_s
         later_s = times_s + lag_s
 
@@ -288,7 +288,7 @@ class Conditioned:
         return replace(self, pieces=tuple(pieces))
 
     def lag_corrected(self, lag_s: float) -> Self:
-        """The same with the torques shifted earlier by a lag [s]."""
+        """The samples with torques shifted earlier by a lag [s]."""
         return replace(self, pieces=tuple(piece.advanced(lag_s) for piece in self.pieces))
 
 

@@ -48,7 +48,7 @@ class NoiseBlock:
         return np.stack([self.x[:, joint] @ values for joint in joints], axis=1)
 
     def within(self, values: FloatArray, sigma: FloatArray) -> "NoiseBlock":
-        """The same without outliers of a fit."""
+        """The block without the outliers of a fit."""
         count = max(int(self.used.sum()), 1)
         limit = float(np.sqrt(chi2_limit(FALSE_REJECTION / count, 1.0)))
         near = np.abs(self.y - self.predicted(values)) <= limit * sigma

@@ -74,7 +74,7 @@ class Run:
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:
-        """All predictions, those that were not fitted last."""
+        """All predictions, the unfitted ones last."""
         return self.fitted if self.predicted is None else (*self.fitted, self.predicted)
 
 

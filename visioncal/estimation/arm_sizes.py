@@ -225,7 +225,7 @@ class _Blocks:
         return self.likelihood.model.maximised(start, low, high, _LITTLE)
 
     def without(self, name: str, logs: FloatArray) -> tuple[Self, FloatArray]:
-        """The same without a block, and the logarithms of the other sizes."""
+        """The model without a block, and the logarithms of the other sizes."""
         at = self.nominal.before.size + list(self.bases).index(name)
         bases = {other: basis for other, basis in self.bases.items() if other != name}
         low = () if name == HARMONICS else self.low

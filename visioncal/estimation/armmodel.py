@@ -273,7 +273,7 @@ def _is_noise(twists: FloatArray) -> bool:
 
 
 def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
-    """The error blocks that stops with such loads can determine."""
+    """The error blocks that stops with the given loads can determine."""
     compliance = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
     weight = () if robot.masses is not None else (WEIGHT,)
     backlash = (BACKLASH,) if loads.from_both_sides else ()

@@ -154,12 +154,12 @@ class ArmData:
 
     @property
     def columns(self) -> IntArray:
-        """(p,) columns of its errors among the unknowns."""
+        """(p,) columns of the arm's errors among the unknowns."""
         return self.fit.unknowns.columns((ARM, self.robot))
 
     @property
     def arm_covariance(self) -> FloatArray:
-        """(p, p) covariance of its errors."""
+        """(p, p) covariance of the arm's errors."""
         return self.fit.covariance((ARM, self.robot))
 
     @property

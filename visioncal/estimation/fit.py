@@ -85,7 +85,7 @@ class Fit:
         return self.solution.noise
 
     def at(self, state: State) -> "Fit":
-        """The same with other values of the unknowns."""
+        """The fit at other values of the unknowns."""
         return replace(self, solution=replace(self.solution, state=state))
 
     @property
@@ -248,7 +248,7 @@ class Fit:
         return covariance_among(self.equations[0], self.problem.moving)
 
     def with_columns(self, *effects: Effect) -> "Fit":
-        """The same with more unknowns, still where they were linearised: for score tests."""
+        """The fit with more unknowns, linearised at the same point: for score tests."""
         values = [self.state.values, *(effect.values for effect in effects)]
         state = State(self.state.edges, np.concatenate(values))
         problem = self.problem.with_effects([*self.problem.effects, *effects])
@@ -276,7 +276,7 @@ class Fit:
         return np.asarray(-self.by_noise @ np.where(held, self.equations[1], 0.0))
 
     def beside_lasting(self, robot: str, errors: ArmErrors) -> "Fit":
-        """The same with an arm's errors that last in time among the unknowns, before a step.
+        """The fit with an arm's errors that last in time among the unknowns, before a step.
 
         Its noise is what is left beside them.
         """

@@ -229,7 +229,7 @@ def measured_scale(
 
 
 def size_of_measured(model: FrameModel, fitted: Fit) -> MeasuredScale | None:
-    """The same of the first target whose poses a program measured; None where it is no unknown."""
+    """Size of the first target whose poses a program measured; None where it is no unknown."""
     for effect in fitted.problem.effects:
         if effect.name == SIZE:
             scale, total = fitted.values((SIZE, ""))[0], fitted.sigmas((SIZE, ""))[0] ** -2.0

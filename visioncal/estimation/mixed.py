@@ -99,7 +99,7 @@ class SizePrior:
         return cls(jacobian, np.full(len(pairs), np.log(TYPICAL_RATIO) / RATIO_LOG_SIGMA))
 
     def beside(self, typical: FloatArray, log_sigma: float) -> "SizePrior":
-        """The same with g more sizes, of (g,) typical logarithms within `log_sigma`."""
+        """The prior with g more sizes, of (g,) typical logarithms within `log_sigma`."""
         return SizePrior(
             np.asarray(block_diag(self.jacobian, np.eye(len(typical)) / log_sigma)),
             np.append(self.mean, typical / log_sigma),

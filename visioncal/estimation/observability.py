@@ -55,7 +55,7 @@ class Direction:
 
     @property
     def is_open(self) -> bool:
-        """Whether it is not determined at all."""
+        """Whether the direction is not determined at all."""
         return self.sigma > _OPEN
 
     def fault(self, at: str) -> str:
@@ -108,7 +108,7 @@ class Turning:
 
     @property
     def is_still(self) -> bool:
-        """Whether it hardly turns at all."""
+        """Whether the robot hardly turns at all."""
         return self.largest_rad < SIGMA_LIMIT_RAD
 
     @property
@@ -118,7 +118,7 @@ class Turning:
 
     @property
     def is_enough(self) -> bool:
-        """Whether it turns about two axes."""
+        """Whether the robot turns about two axes."""
         return not self.is_still and not self.has_lone_axis
 
     def words(self, flange: FloatArray, stops: str, frame: str) -> str:

@@ -78,7 +78,7 @@ class InlierFit:
         return self.problem.subset(self.used)
 
     def with_noise(self, noise: Noise) -> Self:
-        """The same beside a noise from which searches start."""
+        """The inlier fit with a noise from which searches start."""
         return replace(self, fit=replace(self.fit, noise=noise))
 
     def refitted(self) -> Self:

@@ -28,7 +28,7 @@ class Parameter:
 
     @property
     def is_length(self) -> bool:
-        """Whether it is in metres."""
+        """Whether the parameter is in metres."""
         return self.kind in _LENGTHS
 
     @property
@@ -40,7 +40,7 @@ class Parameter:
 
     @property
     def unit(self) -> float:
-        """Equivalent of a radian."""
+        """The parameter's unit that compares with a radian."""
         return LEVER_M if self.is_length else 1.0
 
     def value(self, table: DHTable) -> float:

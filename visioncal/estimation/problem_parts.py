@@ -152,7 +152,7 @@ class FramePrior:
 
     @property
     def name(self) -> str:
-        """NAME of its `[prior.NAME]`."""
+        """NAME of the prior's table `[prior.NAME]`."""
         return f"{self.first}_from_{self.second}"
 
     @property

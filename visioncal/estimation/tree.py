@@ -22,7 +22,7 @@ class Branch:
 
     @property
     def is_unknown(self) -> bool:
-        """Whether it is estimated."""
+        """Whether the edge is estimated."""
         return not self.robot and self.known is None
 
 

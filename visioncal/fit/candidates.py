@@ -72,12 +72,12 @@ class Candidate:
 
     @property
     def limit(self) -> float:
-        """The least likelihood ratio by which it is opened."""
+        """The least likelihood ratio by which the candidate is opened."""
         return SIGNIFICANT if self.effect is None else self.effect.size.limit
 
     @property
     def name(self) -> str:
-        """The name of its effect; empty of others."""
+        """The name of the candidate's effect; empty without one."""
         return "" if self.effect is None else self.effect.name
 
     @property
@@ -141,7 +141,7 @@ def opened(
 
 
 def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
-    """All that are not open yet, with their scores."""
+    """All candidates that are not open yet, with their scores."""
     seen = [camera for camera in fit.unknowns.lenses if images_of(pairs, camera)]
     growing = (*effects_of_lenses(fit), *map(BoardSwells, seen))
     yield from beside_zooms(fit, scored(fit, growing, sole_flange(fit), pairs))

@@ -133,7 +133,7 @@ class Tried:
     white: float = 1.0
 
     def beside(self, rows: FloatArray, shared: "Shared") -> Self:
-        """The same with rows (d k, r + c + 1) of k more stops."""
+        """The trial given rows (d k, r + c + 1) of k more stops."""
         covariance = shared.independent[self.white]
         is_new = self.process is not None
         if self.process is not None:

@@ -55,7 +55,7 @@ class Products:
     sign: float = 1.0  # Of these products.
 
     def summed(self) -> FloatArray:
-        """(d + 1, d + 1) Gram matrix of all."""
+        """(d + 1, d + 1) sum of the sightings' Gram matrices."""
         h, r = self.heads.shape[1], self.functions.shape[1]
         found = np.zeros((h + 2 * r + 1, h + 2 * r + 1))
         found[:h] = self.heads.sum(axis=0)

@@ -301,7 +301,7 @@ def _similar(features: FloatArray, count: int) -> list[IntArray]:
 def _by_groups(
     alone: StopErrors, kinds: Sequence[Process], groups: Sequence[IntArray]
 ) -> list[tuple[Tried, float]]:
-    """The same by some groups of stops; what a group excludes is not tried on others."""
+    """Trials by groups of stops; one that a group excludes is not tried on others."""
     # Most arms have next to none.
     grid = [*_grid(kinds, (0.1, *SIZES), alone.rest, np.zeros((alone.count, 0)))]
     left = [(one, 0.0) for one in grid]

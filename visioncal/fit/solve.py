@@ -44,7 +44,7 @@ _OPENED = 5
 
 @dataclass(frozen=True, eq=False)
 class CellFit:
-    """The fit of a cell, and how it came about."""
+    """The fit of a cell, with the sightings and doubts behind it."""
 
     fit: Fit
     left_out: LeftOut

@@ -61,7 +61,7 @@ class Unknown(ABC):
 
     @property
     def count(self) -> int:
-        """The number of its columns."""
+        """Number of the unknown's columns."""
         return len(self.units)
 
 

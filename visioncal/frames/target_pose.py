@@ -334,7 +334,7 @@ class TargetPose:
 
     @property
     def rms_deg(self) -> float:
-        """The same in rotation [deg]."""
+        """Root mean square of the residuals in rotation [deg]."""
         return float(np.sqrt(np.mean(self.away_deg[self.inliers] ** 2)))
 
 

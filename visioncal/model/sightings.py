@@ -74,7 +74,7 @@ class Sighting:
 
     @property
     def is_stated(self) -> bool:
-        """Whether it is a prior of where one frame is in another."""
+        """Whether the sighting is a prior of where one frame is in another."""
         return self.view < 0
 
     @property
@@ -84,7 +84,7 @@ class Sighting:
 
     @property
     def directions(self) -> int:
-        """How many of the six directions of a pose it determines."""
+        """Number of the six directions of a pose that the sighting determines."""
         if isinstance(self.evidence, MeasuredPlace):
             return len(self.evidence.axes)
         if isinstance(self.evidence, MeasuredPose):

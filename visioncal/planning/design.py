@@ -45,7 +45,7 @@ class Accuracy:
 
     @property
     def words(self) -> str:
-        """States it: `0.12 mm and 0.02 deg`."""
+        """The accuracy in words: `0.12 mm and 0.02 deg`."""
         return "not determined" if self.is_open else mm_and_deg(self.mm, self.deg)
 
 
@@ -170,12 +170,12 @@ class Design:
 
     @property
     def predicted(self) -> Accuracy:
-        """Accuracy predicted with all of them."""
+        """Accuracy predicted with all chosen stops."""
         return self.history[-1]
 
     @property
     def before(self) -> Accuracy:
-        """Accuracy predicted without any of them."""
+        """Accuracy predicted without any chosen stop."""
         return self.history[0]
 
 

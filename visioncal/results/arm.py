@@ -53,7 +53,7 @@ class JointBacklash:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is significant."""
+        """Whether the estimate is significant."""
         return abs(self.deadband_rad) > _SURE * self.sigma_rad
 
 
@@ -70,7 +70,7 @@ class ArmParameter:
 
     @property
     def is_sure(self) -> bool:
-        """Whether its change is significant."""
+        """Whether the change is significant."""
         return self.sigma is not None and abs(self.change) > _SURE * self.sigma > 0.0
 
 

@@ -215,7 +215,7 @@ def entry_of_check(document: Mapping[str, Any], label: str = "verify.json") -> E
 
 
 def _utc(created: str) -> str:
-    """A time as entries have it, so that their order as texts is that of the acts."""
+    """Formats a time for entries, so that they sort as texts in the order of the acts."""
     with reading(f"the time {created!r}", "a time", "Take the result as it was written."):
         then = datetime.fromisoformat(created)
         return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()

@@ -190,7 +190,7 @@ class CameraResult:
         return inverse, -inverse @ np.concatenate([projected.jacobian_intrinsics, by_field], axis=2)
 
     def carried(self, jacobian: FloatArray) -> "CameraResult":
-        """The camera beside other edges, given their Jacobian by the present ones."""
+        """The camera's result given other edges, by their Jacobian by the present ones."""
         if self.edge_covariance is None and self.field is None:
             return self
         edges, field = self.edge_covariance, self.field

@@ -142,7 +142,7 @@ class Calibration(CalibrationSections):
 
     @cached_property
     def tree(self) -> FrameTree:
-        """Tree of its frames."""
+        """Tree of the result's frames."""
         cell = self.by_name
         return FrameTree(
             cell.reference,

@@ -30,7 +30,7 @@ class FrameTree:
 
     @property
     def last(self) -> dict[str, str]:
-        """Parent of each frame without the former ones."""
+        """Parent of each frame, without former places of frames that moved."""
         return {name: parent for name, parent in self.parents.items() if name not in self.former}
 
     def edge_of(self, frame: str) -> Edge:

@@ -94,12 +94,12 @@ class CameraTable(TableModel):
 
     @property
     def model(self) -> CameraKind:
-        """The model of its lens."""
+        """The model of the camera's lens."""
         return "brown" if self.seeing == "points" else self.seeing
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """(width, height) of its images [px], if declared."""
+        """(width, height) of the camera's images [px], if declared."""
         return None if self.resolution is None else (self.resolution[0], self.resolution[1])
 
     @property

@@ -65,7 +65,7 @@ class Stream:
 
     @property
     def has_robot_state(self) -> bool:
-        """Whether it has poses or joints of a robot."""
+        """Whether the stream has poses or joints of a robot."""
         return cols.POSE[0] in self or "q1_rad" in self
 
     def joints(self) -> tuple[FloatArray, FloatArray]:

@@ -64,7 +64,7 @@ class View:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Paths of its image and its depth, where it has them."""
+        """Paths of the view's image and depth, where it has them."""
         return tuple(filter(None, (self.image, self.depth)))
 
     @property

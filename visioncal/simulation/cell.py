@@ -61,7 +61,7 @@ class SimulatedSight:
 
     @property
     def is_of_lens(self) -> bool:
-        """Whether it is for the camera's intrinsics only."""
+        """Whether the sight is for the camera's intrinsics only."""
         return self.stop < 0 and self.stamp_s is None
 
     def numbered(self, view: int) -> "SimulatedSight":

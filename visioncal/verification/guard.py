@@ -105,7 +105,7 @@ class Guarded:
 
     @property
     def document(self) -> dict[str, Any]:
-        """A document for JSON, without what is not known."""
+        """A document for JSON, without unknown values."""
         causes = [
             {name: value for name, value in vars(cause).items() if value is not None}
             for cause in self.causes

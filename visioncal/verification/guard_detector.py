@@ -159,7 +159,7 @@ class Detector:
         return replace(self, **none)
 
     def digest(self) -> str:
-        """The sha256 of its numbers."""
+        """The sha256 of the rows' numbers."""
         return sha256(b"".join(values.tobytes() for values in vars(self).values())).hexdigest()
 
 

@@ -70,7 +70,7 @@ class SideReading(Reading):
 
     @property
     def of_rotations(self) -> tuple[object, ...]:
-        """The same for readings that have the same `rotations` of the same numbers."""
+        """Key of the `rotations`: equal for readings that give the same of the same numbers."""
         written = self.written, self.folded
         return self.rotation, written, self.terms, self.angle_unit, self.by_place
 
@@ -156,7 +156,7 @@ class Hypothesis:
 
     @property
     def chain_class(self) -> Hashable:
-        """The same for readings that close the chain alike.
+        """Key of the chain: equal for readings that close it alike.
 
         Inverting the robot's poses, inverting the camera's and changing the mount all exchange the
         unknown edges; one unit for both sides scales the cell.

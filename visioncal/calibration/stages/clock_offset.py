@@ -33,7 +33,7 @@ class ClockPair:
 
     @property
     def words(self) -> str:
-        """Both in words, as in messages and results."""
+        """Names of camera and robot in words, as in messages and results."""
         return f"{self.camera} and robot {self.robot or 'robot'}"
 
     @property

@@ -292,7 +292,7 @@ def _judged(
     further: str,
     before: DepthResult | None,
 ) -> Finding:
-    """Whether a depth is true, or what it was before, in mm at the distances of the views."""
+    """The finding on the error of depth, in mm at the distances of the views."""
     true = np.concatenate([cells.true_m for cells in found])
     known = before or DepthResult.exact()
     away = result.values - known.values

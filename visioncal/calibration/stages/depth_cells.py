@@ -186,7 +186,7 @@ class Sensor:
         return chosen_rows(cells, on_board(cells, size))
 
     def lengths(self, rays: FloatArray) -> FloatArray:
-        """(n,) what is measured along (n, 3) rays of unit depth, over their depth."""
+        """(n,) ratio of measured length to depth along (n, 3) rays of unit depth."""
         return np.linalg.norm(rays, axis=1) if self.is_ray else np.ones(len(rays))
 
     def _plane_errors(self, seen: Corners, pose: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -124,7 +124,7 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
 
 
 def _misread(robot: Robot, words: str, step: str) -> MatchedJoints:
-    """No angles, with what is wrong with them."""
+    """The result without angles, and the reason."""
     finding = Finding("misread_joints", words, Remedy(step))
     return MatchedJoints(robot, misread=f"{words} {step}", warnings=(finding,))
 

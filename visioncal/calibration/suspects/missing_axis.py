@@ -123,7 +123,7 @@ def _left_by_step(motion: FloatArray) -> float:
 
 
 def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-    """A line in the base that leaves the least across it.
+    """The line in the base with the least residuals across it.
 
     Returns:
         Its direction (3,), the motion along it (m,) [m], the rms by axis across it [m], and how far

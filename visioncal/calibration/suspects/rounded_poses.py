@@ -75,7 +75,7 @@ def _step(numbers: FloatArray) -> float:
 
 
 def _angle_step(quaternions: FloatArray) -> tuple[float, str]:
-    """The same of angles [deg] as they were written, and how these are called."""
+    """Step of angles [deg] as they were written, and the name of their form."""
     round_rows = {
         digits: (quaternions == np.round(quaternions, digits)).all(axis=1).mean()
         for digits in range(1, _MOST_DIGITS + 1)

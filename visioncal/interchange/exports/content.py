@@ -296,7 +296,7 @@ class Content(Placement):
 
     @property
     def notes(self) -> list[str]:
-        """Comment lines: its heading, and its conditions."""
+        """Comment lines: the heading, and the conditions under which the content holds."""
         return [*self.heading, *(f"only where: {condition.words}" for condition in self.conditions)]
 
     @property

@@ -78,7 +78,7 @@ class FileGroup:
 
     @property
     def is_images(self) -> bool:
-        """Whether they are images by their names."""
+        """Whether the files are images by their names."""
         return is_image_name(self.label)
 
     @cached_property
@@ -214,7 +214,7 @@ def _series(source: Path, files: Sequence[Path], ending: str) -> Iterator[FileGr
 
 
 def _walked(folder: Path, depth: int) -> Iterator[Path]:
-    """Files of a folder and of those in it."""
+    """Files of a folder and of the folders in it."""
     yield from files_in(folder)
     if depth > 1:
         with suppress(OSError):

@@ -33,12 +33,12 @@ class PoseImportOptions:
 
     @property
     def rotation(self) -> str:
-        """Form of the rotations in the stated form; empty where none is stated."""
+        """Form of the rotations by the stated form of poses; empty where none is stated."""
         form = self.form or ""
         return POSE_FORMS[form].rotation if form in POSE_FORMS else form
 
     def over(self, source: Self) -> Self:
-        """These options, and those of the source where they leave the choice to it."""
+        """Completes the options by those of the source where they leave the choice to it."""
         stated = {name: value for name, value in vars(self).items() if value not in ((), None)}
         return replace(source, **stated)
 
@@ -89,7 +89,7 @@ class ImportOptions:
         return {"model": self.robot_model} | ({} if self.tip is None else {"tip": self.tip})
 
     def with_poses(self, robot: PoseImportOptions, camera: PoseImportOptions) -> Self:
-        """These options over what a source states of its poses."""
+        """Completes the options by the source's statements on its poses."""
         return replace(self, robot=self.robot.over(robot), camera=self.camera.over(camera))
 
 

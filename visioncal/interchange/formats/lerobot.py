@@ -124,7 +124,7 @@ class _Info:
 
     @classmethod
     def of(cls, source: Path) -> Self:
-        """Reads it; raises DataError."""
+        """Reads a data set; raises DataError."""
         where = "meta/info.json"
         with reading(str(_info(source)), "that of a data set of LeRobot", "Download it again."):
             document = mapping(parse_json(read_text(_info(source)), where), where)

@@ -203,7 +203,7 @@ def _orders(
 
 
 def _one_over(fields: Fields, group: FileGroup) -> Iterator[Match]:
-    """Pairings in natural order with each row, or each file, in turn as the one that is over."""
+    """Pairings in natural order, leaving out each row, or each file, in turn."""
     rows, files = len(fields), len(group.files)
     if min(rows, files) < _FEWEST_PAIRED or abs(rows - files) != 1:
         return

@@ -120,7 +120,7 @@ class PoseFields:
 
     @property
     def is_of_target(self) -> bool:
-        """Whether the names are those of poses of the target."""
+        """Whether the names suggest poses of the target."""
         return self.is_named and (self.is_seen or self.sides == ["camera"])
 
     def is_like(self, names: Sequence[str], fields: Fields) -> bool:

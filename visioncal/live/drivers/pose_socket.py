@@ -62,7 +62,7 @@ class _Link:
                 self.peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
     def receive(self) -> None:
-        """Adds what has come to its text; raises _LostError."""
+        """Adds received bytes to the text; raises _LostError."""
         # More than this is refused anyway.
         while len(self.received) <= 2 * _MAX_LINE:
             try:
@@ -90,7 +90,7 @@ class _Link:
             raise _LostError
 
     def close(self) -> None:
-        """Closes it, so that its last answer arrives."""
+        """Closes the link, so that the last answer arrives."""
         with suppress(OSError):
             # Unread bytes would reset the link, and take the last answer away.
             self.peer.shutdown(socket.SHUT_WR)
@@ -144,7 +144,7 @@ class SocketArm:
 
     @property
     def invitation(self) -> str:
-        """Where it listens, and where the robot's programs are."""
+        """Words on the address that listens, and on the robot's programs."""
         is_own = self.host == "localhost" or self.host.startswith("127.")
         who = "Programs of this computer alone" if is_own else "All computers that reach this one"
         return (

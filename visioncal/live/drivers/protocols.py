@@ -127,7 +127,7 @@ class CameraDevice(Protocol):
 
     @property
     def resolution(self) -> tuple[int, int]:
-        """(width, height) of its pictures [px]."""
+        """(width, height) of the camera's pictures [px]."""
 
     @property
     def factory(self) -> Camera | None:
@@ -145,7 +145,7 @@ class CameraDevice(Protocol):
         """
 
     def close(self) -> None:
-        """Releases it; may be called twice."""
+        """Releases the device; may be called twice."""
 
 
 @runtime_checkable
@@ -179,7 +179,7 @@ class DeviceSetup:
 
 
 class Stopwatch:
-    """Time since its start during which this program ran.
+    """Time during which this program ran, since the start.
 
     It is read repeatedly while waiting for a device. When a virtual machine pauses or a computer
     swaps, all devices seem late at once, though none was silent.
@@ -190,11 +190,11 @@ class Stopwatch:
         self.restart()
 
     def restart(self) -> None:
-        """Sets it to zero."""
+        """Sets the stopwatch to zero."""
         self._read_s, self._sum_s = self._now(), 0.0
 
     def read(self) -> float:
-        """Time since its start without stalls [s]."""
+        """Time since the start, without stalls [s]."""
         now = self._now()
         # Longer is a stall of this computer.
         self._sum_s += min(now - self._read_s, 0.2)

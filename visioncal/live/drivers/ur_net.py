@@ -231,7 +231,7 @@ class Condition:
 
     @property
     def is_polyscope_x(self) -> bool:
-        """Whether it runs PolyScope X."""
+        """Whether the controller runs PolyScope X."""
         return self.version[0] >= _POLYSCOPE_X
 
     def check_moves(self) -> None:

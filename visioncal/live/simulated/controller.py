@@ -270,7 +270,7 @@ class SimulatedController:
         return float(self._ask("guide", q, speed, acceleration))
 
     def close(self) -> None:
-        """Ends it; may be called twice."""
+        """Ends the controller; may be called twice."""
         self._process.terminate()
         self._process.join(5.0)
         self._process.kill()

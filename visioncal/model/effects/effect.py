@@ -65,7 +65,7 @@ class Effect(ABC):
     @property
     @abstractmethod
     def count(self) -> int:
-        """Number c of its unknowns."""
+        """Number c of the effect's unknowns."""
 
     @abstractmethod
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:

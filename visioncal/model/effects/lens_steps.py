@@ -36,7 +36,7 @@ class LensSteps(LensEffect):
 
 @dataclass(frozen=True, eq=False)
 class LensChanges(LensSteps):
-    """The same with the first two coefficients of distortion, as where pictures are rectified."""
+    """Lens steps with the first two coefficients of distortion, as where pictures are rectified."""
 
     kind, count, wider = "lens changes", 5, ""
     clause = "the lens was exchanged, or its pictures rectified"

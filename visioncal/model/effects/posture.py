@@ -66,7 +66,7 @@ class PostureEffect(Effect):
         return np.asarray(np.linalg.pinv(every, rcond=1e-9))
 
     def covariance_of_frames(self, square: FloatArray) -> FloatArray:
-        """(12, 12) of these twists, as other stops have them.
+        """(12, 12) covariance of these twists, as other stops have them.
 
         The stops are some of all postures: each is an independent draw (White 1980).
 
@@ -154,21 +154,21 @@ class Stretches(PostureEffect, Named):
 
 
 class XStretches(Stretches):
-    """Along its base's x."""
+    """Stretch along the base's x."""
 
     kind, shares = "x stretches", ((0, 0),)
     clause = "the robot's x has another scale"
 
 
 class YStretches(Stretches):
-    """Along its base's y."""
+    """Stretch along the base's y."""
 
     kind, shares = "y stretches", ((1, 1),)
     clause = "the robot's y has another scale"
 
 
 class ZStretches(Stretches):
-    """Along its base's z."""
+    """Stretch along the base's z."""
 
     kind, shares = "z stretches", ((2, 2),)
     clause = "the robot's z has another scale"

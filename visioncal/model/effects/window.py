@@ -64,7 +64,7 @@ class Window(Displacement):
         return np.asarray(np.linalg.svd(np.array([self.normal]))[2][1:])
 
     def _normals(self) -> FloatArray:
-        """(3, 3) the normal, and turned by a little about either axis."""
+        """(3, 3) the normal, and the normal after a small turn about each of two axes."""
         normals = np.array(self.normal) + _STEP * np.vstack([np.zeros(3), self._tangents()])
         return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 

@@ -42,7 +42,7 @@ class FleetRow:
 
     @cached_property
     def courses(self) -> tuple[Course, ...]:
-        """The years of its transforms."""
+        """Courses of the cell's transforms over the years."""
         return courses(self.entries)
 
     @cached_property

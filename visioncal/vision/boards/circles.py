@@ -101,7 +101,7 @@ class CircleGrid(Board):
         return low - target.diameter_m / 2, high + target.diameter_m / 2
 
     def discs(self, target: Target) -> FloatArray:
-        """(n, 3) centres and radii of its circles [m]."""
+        """(n, 3) centres and radii of the circles [m]."""
         places = self.corners(target)
         places[:, 2] = target.diameter_m / 2
         return places

@@ -105,7 +105,7 @@ class Dots(PointsKind, Board):
         return (places - radii).min(axis=0), (places + radii).max(axis=0)
 
     def discs(self, target: Target) -> FloatArray:
-        """(n, 3) centres and radii of its dots [m]."""
+        """(n, 3) centres and radii of the dots [m]."""
         return np.column_stack([self.corners(target)[:, :2], _radii_m(target)])
 
     def scaled(self, target: Target, factor: float) -> Target:

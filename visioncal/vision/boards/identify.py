@@ -53,7 +53,7 @@ class Identity:
 
     @property
     def is_single(self) -> bool:
-        """Whether it is a single marker."""
+        """Whether the target is a single marker."""
         return self.board.columns * self.board.rows == 1
 
     def target(self, name: str, square_m: float) -> Target:

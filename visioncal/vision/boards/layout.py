@@ -53,12 +53,12 @@ class Marker:
 
     @cached_property
     def side_px(self) -> float:
-        """Mean length of its sides [px]."""
+        """Mean length of the marker's sides [px]."""
         return float(np.linalg.norm(self.px - np.roll(self.px, 1, axis=0), axis=1).mean())
 
     @property
     def is_genuine(self) -> bool:
-        """Whether it resembles its ideal."""
+        """Whether the marker resembles its ideal."""
         # Strong lens distortion lowers the likeness to 0.55. Codes of sixteen bits occur by chance
         # in other markers' squares, with up to 0.8; longer codes do not.
         return self.likeness > (0.83 if self.family in ("4X4", "16h5") else 0.5)

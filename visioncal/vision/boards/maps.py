@@ -87,7 +87,7 @@ def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray],
 def _undistorted(
     px: FloatArray, board: FloatArray, axis: OpticalAxis
 ) -> tuple[Callable[[FloatArray], FloatArray], OpticalAxis] | None:
-    """As `_homography`, after removal of radial distortion; None if that is not determined.
+    """Homography after removal of radial distortion; None if that is not determined.
 
     A point o relative to the axis, at distance r, maps to o / (1 + a r^2 + b r^4) (Fitzgibbon
     2001). Each Gauss-Newton step of a, b and the axis is followed by a least-squares homography;

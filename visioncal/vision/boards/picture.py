@@ -107,7 +107,7 @@ class Picture(BoardKind):
         return {**document, "image": name}, {name: base64.b64decode(document["image"])}
 
     def corners(self, target: Target) -> FloatArray:
-        """(n, 3) middles of its patches [m], row by row."""
+        """(n, 3) middles of the picture's patches [m], row by row."""
         _, (width, height) = self.extent_m(target)
         x = (np.arange(target.columns) + 0.5) * width / target.columns
         y = (np.arange(target.rows) + 0.5) * height / target.rows
@@ -119,7 +119,7 @@ class Picture(BoardKind):
         return f"picture {target.name}"
 
     def picture(self, target: Target) -> Image | None:
-        """(h, w) its grey levels."""
+        """(h, w) grey levels of the picture."""
         grey = _grey(cast("PictureTarget", target).image)
         return None if isinstance(grey, str) else grey
 

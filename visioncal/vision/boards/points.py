@@ -38,7 +38,7 @@ class PointsKind(BoardKind):
     needed_columns: ClassVar[int]  # Number of the needed ones.
 
     def corners(self, target: Target) -> FloatArray:
-        """(n, 3) points [m], in the order of its table."""
+        """(n, 3) points [m], in the order of the table."""
         return np.array(target.points_m, dtype=float)
 
     def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -61,12 +61,12 @@ class Print:
         return self.texel_m * np.array(self.grey.shape[::-1], float)
 
     def middle_at(self, pose: FloatArray) -> FloatArray:
-        """(3,) its middle at a (4, 4) pose [m]."""
+        """(3,) middle of the print at a (4, 4) pose [m]."""
         return pose[:3, :2] @ (self.corner_m + self.size_m / 2) + pose[:3, 3]
 
     @property
     def outline_m(self) -> FloatArray:
-        """(4, 3) its corners [m]."""
+        """(4, 3) corners of the print [m]."""
         return np.pad(
             self.corner_m + self.size_m * [[0, 0], [1, 0], [1, 1], [0, 1]], ((0, 0), (0, 1))
         )
