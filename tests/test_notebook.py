@@ -68,7 +68,7 @@ def test_every_listed_name_exists():
         assert getattr(visioncal, name) is not None
 
 
-def test_a_name_that_is_not_there_suggests_the_nearest():
+def test_an_unknown_name_suggests_the_nearest():
     transforms = made_up().calibration.transforms
     with pytest.raises(KeyError, match="Did you mean flange_from_cam"):
         transforms["flange_from_camera"]
@@ -123,7 +123,7 @@ def test_views_without_corners_keep_their_place():
         ),
     ],
 )
-def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
+def test_malformed_corners_are_refused_by_array_and_index(corners, words):
     assert "corners.csv" not in str(raised(DataError, words, from_corners, corners))
 
 

@@ -161,7 +161,7 @@ def test_no_command_runs_code_of_the_current_folder(trap, inputs, tmp_path):
 
 
 @pytest.mark.slow
-def test_processes_of_the_page_and_of_the_simulated_cell_run_none_either(trap, tmp_path):
+def test_processes_of_the_page_and_of_the_simulated_cell_run_no_foreign_code(trap, tmp_path):
     # From a script elsewhere, so that the current folder is not on the path of this process.
     script = tmp_path / "script.py"
     script.write_text(

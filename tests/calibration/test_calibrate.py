@@ -142,7 +142,7 @@ def test_a_view_held_out_by_the_session_is_in_no_fit(session_copy):
     assert spoilt.validation.holdout.mm == pytest.approx(50.0, abs=2.0)
 
 
-def test_images_and_measured_poses_in_one_session(session_copy, done, result):
+def test_images_and_measured_poses_are_calibrated_in_one_session(session_copy, done, result):
     """Some rows bring the target's pose themselves, the lens being estimated from the others."""
     evidence = {view.view: view for view in done[0].evidence}
 
@@ -159,7 +159,7 @@ def test_images_and_measured_poses_in_one_session(session_copy, done, result):
     assert "combined_translation_mm" in mixed.noise
 
 
-def test_it_tells_of_its_progress_and_the_same_session_gives_the_same_numbers(rendered, done):
+def test_progress_is_reported_and_the_same_session_gives_the_same_numbers(rendered, done):
     found, told = done
     assert ("detect", 12, 12) in told
     assert {"pnp", "solve", "examine", "judge"} <= {stage for stage, *_ in told}

@@ -163,7 +163,7 @@ def test_the_joint_covariance_is_in_the_order_of_the_transforms_where_a_frame_mo
 
 
 @pytest.mark.slow
-def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
+def test_all_faults_are_named_and_the_answer_is_that_of_a_sound_cell():
     pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
     cell = simulate(replace(PLAIN, moved=pushes, swapped_rows=1, stray_images=3, seed=3))
     found = solved(cell)
@@ -278,7 +278,7 @@ def test_cameras_whose_wrong_lenses_are_held_leave_out_few_views():
 
 
 @pytest.mark.slow
-def test_cameras_in_the_hand_and_poses_that_are_given():
+def test_cameras_in_the_hand_are_calibrated_by_given_poses():
     cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
     cell = simulate(replace(PLAIN, cameras=cameras, boards=(FLOOR,)))
     found = calibrate(cell_session(cell, "cell", seen="poses"))
@@ -479,7 +479,7 @@ def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
 
 
 @pytest.mark.slow
-def test_a_prior_narrows_what_it_is_of_and_is_named_where_it_is_wrong(clean):
+def test_a_prior_narrows_its_frame_and_is_named_where_it_is_wrong(clean):
     cell, before = clean
     height = float(cell.between("base_a", "base_b")[2, 3])
     found = solved(cell, prior={"base_a_from_base_b": {"z_m": height, "sigma_m": 1e-6}})

@@ -86,7 +86,7 @@ def test_joints_are_placed_in_time_too(session):
 
 
 @pytest.mark.slow
-def test_its_recording_gives_the_same(session, tmp_path):
+def test_a_recording_gives_the_same_clock_as_its_session(session, tmp_path):
     write_recording(tmp_path / "session.rrd", session, None, (), None)
     one, other = calibrate(session), calibrate(tmp_path / "session.rrd")
     assert one.session_sha256 == other.session_sha256
@@ -139,7 +139,7 @@ def dwelling(ahead_s: float, at_rest: int = 20) -> Session:
     return streamed((stamps, measured_poses(cell)), (times_s, forward(cell.robot.arm, joints)))
 
 
-def test_views_in_motion_are_left_out_where_nothing_tells_the_offset():
+def test_views_in_motion_are_left_out_where_nothing_determines_the_offset():
     session = dwelling(0.0, at_rest=14)
     # Views that no fit may use tell nothing of the clocks either.
     held = [replace(view, holdout=view.number >= 14) for view in session.views]
@@ -367,7 +367,7 @@ def test_clocks_far_apart_are_named_where_no_offset_fits():
 
 
 @pytest.mark.slow
-def test_motion_that_does_not_tell_the_offset_is_refused_unless_it_is_stated():
+def test_motion_that_does_not_determine_the_offset_is_refused_unless_it_is_stated():
     # Its sigma would be longer than the recording.
     words = r"is left open by 420 views, of which 0 .* at rest: the motion says nothing of it"
     raised(DegenerateError, words, calibrate, going())

@@ -222,7 +222,7 @@ def moving(kind, mount, count=16):
         ("scara", MOUNTS[1], "base_from_cam", "z"),
     ],
 )
-def test_a_machine_that_cannot_tilt_hears_what_to_measure(kind, mount, name, keys):
+def test_a_machine_that_cannot_tilt_is_asked_for_a_measured_height(kind, mount, name, keys):
     session, true = moving(kind, mount)
     error = raised(DegenerateError, "not determined at all", visioncal.calibrate, session)
     assert f"[prior.{name}]" in error.next_step
@@ -249,7 +249,7 @@ def test_a_rail_leaves_a_turn_open_too(mount):
 
 
 @pytest.mark.slow
-def test_a_lens_that_far_views_leave_open_hears_what_to_state():
+def test_a_lens_that_far_views_leave_open_is_refused_with_the_keys_to_state():
     far = CellOptions(
         views=14, seed=1, state_intrinsics=False, distance_m=(2.8, 3.2), pixel_sigma_px=0.3
     )
@@ -281,7 +281,7 @@ def test_a_base_that_creeps_before_a_fixed_camera_is_among_what_is_named(seed, t
     assert cause.kind == "base_creeps" or verdict.top[0].startswith("Likeliest of these")
 
 
-def test_a_lens_that_was_zoomed_far_is_none_that_varies(tmp_path):
+def test_a_lens_that_was_zoomed_far_is_not_one_that_varies(tmp_path):
     """By 4 % midway: beside errors that last, it gains less than one that varies does alone."""
 
     def zoomed(far, _):

@@ -263,7 +263,7 @@ def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():
     ],
     ids=["three", "one", "axis"],
 )
-def test_motion_that_tells_too_little_is_refused(change, words):
+def test_motion_that_determines_too_little_is_refused(change, words):
     shop = tracked(POINT, joints=change(tracked(POINT).joints))
     with pytest.raises(DegenerateError, match=words):
         known_of(session_of(shop, joints="one pose" not in words, poses="one pose" in words))

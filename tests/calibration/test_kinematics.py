@@ -304,7 +304,7 @@ def test_the_result_is_in_the_convention_that_is_asked_for(wrong, convention):
 
 
 @pytest.mark.parametrize("name", ["ur5e", slow("irb120"), slow("panda")])
-def test_readings_of_one_point_tell_three_values_less(name):
+def test_readings_of_one_point_determine_three_values_fewer(name):
     """A point of the tool has a place and no direction."""
     robot = load_robot(name)
     arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
@@ -554,7 +554,7 @@ def test_the_indices_are_as_published():
     assert found == pytest.approx(wanted | {"o5": 1.0 / (1 / 8 + 1 / 4 + 1 / 2)})
 
 
-def test_stops_are_planned_that_tell_springs():
+def test_stops_are_planned_that_determine_springs():
     options = CellOptions(robot="ur10e")
     cell, q = true_cell(options), postures_in_view(options, 12)
     springs, rigid = (stop_factors(cell, PURPOSES[name], q) for name in ("elastic", "kinematics"))

@@ -111,7 +111,7 @@ def test_a_mount_that_is_not_given_is_that_of_the_likelier_cell(name, is_measure
     assert guess.notes[0].startswith(f"The mount was not given and is taken for {mount}")
 
 
-def test_a_mount_that_nothing_tells_is_asked_for():
+def test_a_mount_that_nothing_determines_is_asked_for():
     poses = cell_poses()
     edges = SOLVERS["park"](poses.true_robot, poses.camera.poses())
     # A tool on which the camera is as far from the flange as the board is from the base.
@@ -695,7 +695,7 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     assert visioncal.calibrate(mended).verdict.status == "good"
 
 
-def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
+def test_an_unknown_robot_is_named_with_the_correction(cell):
     document = cell / "session.toml"
     document.write_text(document.read_text("utf-8").replace('"ur10e"', '"ur10ee"'), "utf-8")
     found = visioncal.doctor(cell).findings[0]

@@ -327,7 +327,7 @@ def test_one_image_of_two_targets_is_two_views_and_rows_name_their_targets(tmp_p
     raised(DataError, r"views\.csv says that view 0 shows 'same'", Session.load, folder)
 
 
-def test_a_board_in_millimetres_is_read_so(tmp_path):
+def test_a_board_in_millimetres_is_read_in_millimetres(tmp_path):
     seen(CHARUCO)[1].save(tmp_path / "cell")
     changed(tmp_path / "cell", "target.toml", "square_m = 0.03", "square_m = 30.0")
     changed(tmp_path / "cell", "target.toml", "square_sigma_m = 1e-07", "")
@@ -466,7 +466,7 @@ def test_the_verdict_says_where_the_corners_contradict_what_is_stated(stated, st
 
 
 @pytest.mark.slow
-def test_every_storage_of_it_is_the_same_session(tmp_path):
+def test_every_stored_form_is_the_same_session(tmp_path):
     seen(stated=1.0)[1].save(tmp_path / "cell")
     session = Session.load(tmp_path / "cell")
     write_recording(tmp_path / "cell.rrd", session, None, (), None)

@@ -42,7 +42,7 @@ def rokae(data: Path) -> Session:
 
 
 @pytest.mark.slow
-def test_charuco_before_a_fixed_camera(real_data):
+def test_a_charuco_board_before_a_fixed_camera_is_calibrated(real_data):
     result = visioncal.calibrate(real_data / "sessions/ric_charuco_eye_to_hand")
     unused = [view for view in result.views if not view.used]
     assert [view.view for view in unused] == [2]
@@ -70,7 +70,7 @@ def test_charuco_before_a_fixed_camera(real_data):
 
 
 @pytest.mark.slow
-def test_a_six_axis_arm_by_a_laser(real_data):
+def test_a_six_axis_arm_is_calibrated_by_a_laser_tracker(real_data):
     known = known_of(rokae(real_data))
     assert known.robot_arm.kinematics.result.nominal.rms_mm > 2.0
     # Plain least squares leave 0.099 mm and 0.038 deg in the fit; left out they are at 0.12 mm.

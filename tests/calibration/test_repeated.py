@@ -128,7 +128,7 @@ def measured(rows):
         ([(0.1, None, 0.0), (0.2, None, 0.0), (0.102, None, 0.0)], {}),
     ],
 )
-def test_near_readings_are_copies_where_no_time_tells_them_apart(rows, repeated):
+def test_near_readings_are_copies_where_no_time_distinguishes_them(rows, repeated):
     assert repeated_rows(measured(rows), {}) == repeated
 
 

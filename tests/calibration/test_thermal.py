@@ -219,7 +219,7 @@ def test_the_report_shows_the_drift(learnt):
     assert len(found.calibration.thermal.views) == len(found.session.views)
 
 
-def test_the_calibration_tells_the_arm_at_any_temperature(learnt, tmp_path):
+def test_the_calibration_gives_the_arm_at_any_temperature(learnt, tmp_path):
     known = learnt("temperatures").calibration
     known.save(tmp_path / "calibration.json")
     again, warm = Calibration.load(tmp_path / "calibration.json"), known.drift.reference_c + 15.0

@@ -301,7 +301,7 @@ def test_angles_of_one_maker_that_were_stated_as_anothers_are_named(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_poses_that_are_there_twice_hide_no_misread_rotations(mount):
+def test_repeated_poses_hide_no_misread_rotations(mount):
     robot, boards = poses_of(mount)
     angles = Rotation.from_matrix(robot[:, :3, :3]).as_euler("xyz")
     read = compose(Rotation.from_rotvec(angles).as_matrix(), robot[:, :3, 3])
@@ -425,7 +425,7 @@ def test_flipped_views_of_a_near_marker_are_named(mount, some):
 
 
 @pytest.mark.parametrize("by", [5, -2, *map(slow, (1, -1, 3, -6))])
-def test_rows_are_any_few_apart(by):
+def test_images_and_poses_a_few_rows_apart_are_named(by):
     session = pairs_session(MOUNTS[0], *shifted(*poses_of(MOUNTS[0], 30), 15, by))
     cause = visioncal.calibrate(session).verdict.causes[0]
     assert cause.kind == "shifted_rows"

@@ -491,7 +491,7 @@ def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
 
 
 @pytest.mark.slow
-def test_all_views_of_one_end_are_off_by_no_chance_whatever_each_is_off_by():
+def test_views_of_one_end_that_are_all_off_are_no_chance():
     """As where the zero of a joint is lost, which moves each flange by its own posture."""
     cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
     flange, amid = cell.robot.base_from_flange.copy(), cell.robot.base_from_flange.copy()
@@ -733,7 +733,11 @@ def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks
         ({"noise_deg": 0.029}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
-        ({"lost": LOST}, "check", "10 of 30 views are not used. The first but for outliers: view "),
+        (
+            {"lost": LOST},
+            "check",
+            "10 of 30 views are not used. The first that is no outlier: view ",
+        ),
         ({"pixel_px": 1.0}, "check", "Corners deviate by 1 px"),
         ({"warnings": remarks(("It is upside down.",))}, "check", "It is upside down."),
         # Coarse poses leave noise open: doubt is about what it is at the least.
@@ -1146,7 +1150,7 @@ def test_the_worst_pair_counts_and_is_named() -> None:
     assert need_met(None, picks) is None
 
 
-def test_a_result_tells_what_it_is_good_for() -> None:
+def test_a_result_states_the_need_that_it_meets() -> None:
     known = calibrated(simulate(CellOptions(views=12)))
     plain = result_of(known)
     assert plain.need is None

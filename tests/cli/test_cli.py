@@ -151,7 +151,7 @@ def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor
     assert not (tmp_path / "new").exists()
 
 
-def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
+def test_a_long_message_is_shortened_in_its_middle():
     words = f"model is {'x' * 100_000}; a name is needed.\nLine 2."
     error = DataError(words, culprits=["y" * 9000])
     assert len(error.message) < 2100
@@ -737,7 +737,7 @@ def place(tmp_path, monkeypatch):
 # Of each kind of advice, tests/cli/test_following.py has a quick one.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in BROKEN if name not in ALIKE])
-def test_of_broken_sessions(place, name):
+def test_broken_sessions_are_answered_with_the_next_step(place, name):
     broken_session(place / "session", BROKEN[name])
     for words in (("doctor", "session"), ("calibrate", "session", "-o", "out")):
         shutil.copytree(place / "session", place / words[0] / "session")
@@ -775,7 +775,7 @@ WRONG_PLACES = {
 @pytest.mark.parametrize(
     "name", [slow(name) if name == "readings to look in" else name for name in WRONG_PLACES]
 )
-def test_of_what_is_given_in_the_wrong_place(place, name):
+def test_arguments_in_the_wrong_place_are_answered_with_the_next_step(place, name):
     words, said, advised = WRONG_PLACES[name]
     write_session(simulate(CellOptions(views=8, seed=4)), place / "session", images=False)
     if "out" in words:
@@ -791,7 +791,7 @@ def test_of_what_is_given_in_the_wrong_place(place, name):
 
 
 @pytest.mark.slow
-def test_of_verify(place):
+def test_failed_checks_are_answered_with_the_next_step(place):
     whole = Session.load(write_session(simulate(CellOptions(views=20, seed=5)), place / "all"))
     replace(whole, views=whole.views[:15]).save(place / "fit")
     assert visioncal("calibrate", "fit", "-o", "out").status == 0
@@ -805,7 +805,7 @@ def test_of_verify(place):
         assert printed_commands(first.said), name
 
 
-def test_of_a_tool(place):
+def test_mistakes_about_a_tool_are_answered_with_the_next_step(place):
     rng = np.random.default_rng(3)
     above, tip = np.eye(3), np.array([0.02, 0.01, 0.15])
     tips = np.tile([0.4, 0.1, 0.2], (8, 1)) + rng.normal(scale=1e-4, size=(8, 3))
@@ -822,7 +822,7 @@ def test_of_a_tool(place):
 
 
 @pytest.mark.slow
-def test_of_a_fixture(place):
+def test_mistakes_about_a_fixture_are_answered_with_the_next_step(place):
     assert visioncal("simulate", "cell", "--touches", "--no-images").status == 0
     assert visioncal("calibrate", "cell", "-o", "out").status == 0
     assert visioncal("tcp", "cell/touches.csv", "-c", "out", "--name", "gripper").status == 0
@@ -844,7 +844,7 @@ def test_of_a_fixture(place):
 
 
 @pytest.mark.slow
-def test_of_dynamics(place, monkeypatch):
+def test_mistakes_about_dynamics_are_answered_with_the_next_step(place, monkeypatch):
     # The motion that is planned need not be a good one: a short search will do.
     monkeypatch.setattr(
         dynamics,

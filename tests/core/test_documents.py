@@ -48,7 +48,7 @@ def file(tmp_path):
         ("", None),
     ],
 )
-def test_yaml_values(text, value):
+def test_yaml_values_are_read(text, value):
     assert parse_yaml(text, "it") == value
 
 
@@ -76,7 +76,7 @@ def test_yaml_values(text, value):
         ("a: \x01", "not YAML"),
     ],
 )
-def test_yaml_that_is_refused(text, words):
+def test_malformed_yaml_is_refused(text, words):
     raised(DataError, words, parse_yaml, text, "it")
 
 
@@ -100,7 +100,7 @@ def test_aliases_cost_nothing(file):
         ('["a\\uDFFFb"]', "half of a letter"),
     ],
 )
-def test_json_that_is_refused(text, words):
+def test_malformed_json_is_refused(text, words):
     raised(DataError, words, parse_json, text, "it")
 
 
@@ -218,7 +218,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("text", TABLES.values(), ids=TABLES.keys())
-def test_tables(file, text):
+def test_tables_of_many_forms_are_read(file, text):
     table = read_table(file("a.csv", text))
     assert table.columns == ("a", "b")
     assert [[float(name) for name in row] for row in table.rows] == [[1, 2], [3, 4]]
@@ -246,7 +246,7 @@ def test_columns_without_names_are_numbered(file):
         ("1," * 1_200_000, "more than 1,000,000 values"),
     ],
 )
-def test_tables_that_are_refused(file, text, words):
+def test_malformed_tables_are_refused(file, text, words):
     raised(DataError, words, read_table, file("a.csv", text))
 
 
@@ -262,7 +262,7 @@ def test_tables_are_read_as_a_chinese_spreadsheet_writes_them(file):
     assert table.columns == ("序号", "位置X(mm)", "姿态RX(°)")
 
 
-def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
+def test_binary_and_too_large_files_are_refused(file, tmp_path):
     raised(DataError, "line 2: a NUL byte", read_json, file("a.json", b"[\n\0]"))
     # A hole in the file: nothing is written to the disk.
     with (tmp_path / "large.csv").open("wb") as large:
@@ -324,7 +324,7 @@ READERS = {".npy": read_arrays, ".npz": read_arrays, ".yml": read_opencv, ".xml"
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_documents_that_were_made_to_break_a_reader(file, name):
+def test_documents_made_to_break_a_reader_are_refused(file, name):
     content, words = HOSTILE[name]
     path = file(name.replace(" ", "_"), content)
     raised(DataError, words, READERS[path.suffix], path)

@@ -262,7 +262,7 @@ def test_toml_errors_give_the_line():
         ('b = "it', None),
     ],
 )
-def test_the_line_that_is_meant_is_said_where_it_is_clear(line, meant):
+def test_the_line_that_is_meant_is_named_where_it_is_clear(line, meant):
     caught = raised(DataError, "is not valid TOML", parse_toml, f"a = 1\n{line}\n", "x.toml")
     said = re.search(r"^Correct line 2 to `(.*?)`\. ", caught.next_step)
     assert (parse_toml(said[1], "x.toml") if said else None) == meant
@@ -293,5 +293,5 @@ def test_a_link_that_leads_nowhere_is_not_replaced_unasked(tmp_path):
         ("a = " + "9" * 5000, "is not valid TOML"),
     ],
 )
-def test_toml_that_no_one_writes_is_refused(text, words):
+def test_malformed_toml_is_refused(text, words):
     raised(DataError, words, parse_toml, text, "x.toml")

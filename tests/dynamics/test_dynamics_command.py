@@ -55,7 +55,7 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_identify_and_validate(folder, tmp_path):
+def test_identified_dynamics_predict_other_motions(folder, tmp_path):
     asked = ("--stream", "excite", "--stream", "sweeps")
     done = visioncal("dynamics", "identify", folder, *asked, "-o", tmp_path / "out").good()
     assert "good" in done.out
@@ -96,7 +96,7 @@ def test_json_holds_what_was_asked_for(folder):
         (("--stream", "excite", "--gains", "1,x"), "--gains is '1,x'"),
     ],
 )
-def test_wrong_wishes_are_named(folder, arguments, words):
+def test_wrong_options_are_named(folder, arguments, words):
     visioncal("dynamics", "identify", folder, *arguments).refused(words)
 
 
@@ -319,7 +319,7 @@ def test_identified_inertias_are_exported(written, run, form, tmp_path):
 
 
 def test_without_known_inertias_there_are_no_bodies(run):
-    with pytest.raises(DataError, match="no links that are bodies"):
+    with pytest.raises(DataError, match="its links have none"):
         ArmDynamics.of(replace(run.identified, consistent=None))
 
 

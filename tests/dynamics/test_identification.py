@@ -118,7 +118,7 @@ def test_the_number_of_identifiable_parameters_is_right(name, inertial, all_of_i
 
 
 @pytest.mark.parametrize("name", ["ur5e", "panda", "generic-6r-1800"])
-def test_base_parameters_tell_all_torques(name):
+def test_base_parameters_determine_all_torques(name):
     robot = load_robot(name)
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
     standard = np.random.default_rng(3).standard_normal(len(base.model.names))
@@ -215,7 +215,7 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     )
     assert "<visual />" in written
     assert "<!-- identified - - yesterday -->" in written
-    raised(DataError, "must be one of a URDF", urdf_with_inertias, load_robot("ur5e"), found)
+    raised(DataError, "must come from a URDF", urdf_with_inertias, load_robot("ur5e"), found)
 
 
 TRUE = np.array([2.0, -1.0, 0.5])

@@ -429,7 +429,7 @@ def test_checks_that_are_impossible_are_named(tmp_path):
         (("--floor", 1900, "--no-sweeps"), "none of 2000 postures within the limits is clear"),
     ],
 )
-def test_wrong_wishes_end_with_status_2_and_no_folder(options, words, tmp_path):
+def test_wrong_options_end_with_status_2_and_no_folder(options, words, tmp_path):
     out = tmp_path / "out"
     plan("ur5e", out, *options).refused(words)
     assert not out.exists()

@@ -394,7 +394,7 @@ def bent(curvature: float, seen: list[float]):
 
 
 @pytest.mark.parametrize("curvature", [-0.5, -3.0, -30.0])
-def test_it_rests_at_the_least_cost_in_few_steps(curvature):
+def test_levenberg_marquardt_rests_at_the_least_cost_in_few_steps(curvature):
     seen: list[float] = []
     found, settled = levenberg_marquardt(0.9, bent(curvature, seen), settled=1e-10)
     assert settled
@@ -556,7 +556,7 @@ def test_poses_and_cost_follow_lens_and_board_as_their_derivatives_say():
     assert np.all(np.delete(away - limit, 9 + SCALE) < 0.0)
 
 
-def test_the_corners_alone_do_not_tell_the_size():
+def test_corners_alone_do_not_determine_the_size():
     middle = compressed(simulate(replace(FINE, views=6, seed=1)))
     grown = compressed(simulate(replace(FINE, views=6, seed=1)), np.eye(19)[9 + SCALE] * 0.01)
     assert np.all(middle.shared_information[9 + SCALE] == 0.0)

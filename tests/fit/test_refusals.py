@@ -97,7 +97,7 @@ def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch, draws):
     assert all(refused)
 
 
-def test_every_view_is_in_the_cell_or_said_to_be_absent():
+def test_every_view_is_in_the_cell_or_reported_as_absent():
     small = made(stops=10)
     own = list(small.cell.sightings)
     line = own[3].corners.take(np.arange(len(own[3].corners.ids)) < 5)

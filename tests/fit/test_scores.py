@@ -139,7 +139,7 @@ def test_a_stated_lens_that_breathes_was_focused_somewhere():
     assert counts["breathing"] == 1
 
 
-def test_many_sightings_are_looked_at_some_at_a_time(fit):
+def test_many_sightings_are_processed_in_parts(fit):
     """Results are those of all at once; no array has rows of more corners than those of some."""
     few, all_at_once = pairs_of(fit.cell, 3), pairs_of(fit.cell, 10**6)
     assert len(few) == 8

@@ -58,7 +58,7 @@ def test_a_prior_counts_with_its_stated_sigma(draws):
     assert min(gains) > 1.0
 
 
-def test_a_component_that_the_views_contradict_goes_alone():
+def test_a_component_that_the_views_contradict_is_left_out_alone():
     small = made(3, 16)
     place = small.edges["cam"][:3, 3] + np.array([0.0, 0.01, 0.0])
     turn = log(small.edges["cam"])[:3]

@@ -198,7 +198,7 @@ def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
     assert np.median(shares) < 0.5
 
 
-def test_a_place_tells_where_its_uncertainty_is_from():
+def test_a_place_states_the_sources_of_its_uncertainty():
     parts = {"pixels": np.diag([1e-8, 4e-8, 0.0]), "robot": np.diag([3e-8, 0.0, 0.0])}
     found = Located(np.zeros(3), parts, np.inf)
     np.testing.assert_allclose(found.sigma_mm, [0.2, 0.2, 0.0], atol=1e-12)
@@ -362,7 +362,7 @@ def pose_words(pose):
     return ",".join(repr(float(value)) for value in [*pose[:3, 3], *turn])
 
 
-def test_every_view_tells_where_the_target_is(cell):
+def test_every_view_states_the_pose_of_the_target(cell):
     made, calibration, session = cell
     to_hand = made.options.mount == TO_HAND
     point = np.array([0.135, 0.09, 0.0])

@@ -166,7 +166,7 @@ def test_derivatives_are_those_of_the_residuals(of):
         ([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], (2, 1), r"about its x .*mm from the x axis"),
     ],
 )
-def test_touches_that_tell_no_direction_are_refused(local, axis, words, off_m):
+def test_touches_that_determine_no_direction_are_refused(local, axis, words, off_m):
     frame, points = some_frame(np.random.default_rng(9)), np.array(local)
     points[axis] = off_m
     touches = replace(featured(9, ONE_EACH)[1], measured=placed(frame, points))
@@ -250,7 +250,7 @@ def small_turns(made):
         (Job(tips=4, contact_m=0.02, cone_deg=20.0), tips_alone, r"at a scatter of 1\d mm"),
     ],
 )
-def test_touches_that_tell_no_tool_are_refused(job, spoil, words):
+def test_touches_that_determine_no_tool_are_refused(job, spoil, words):
     with pytest.raises((DataError, DegenerateError), match=words):
         fit_pivot(spoil(touches_of(job, 1)))
 
@@ -330,7 +330,7 @@ def test_a_group_that_alone_determines_a_direction_is_not_accused():
     assert found.fit.state[5] == pytest.approx(TRUTH[5] + 0.05, abs=20 * SIGMA)
 
 
-def test_where_nothing_tells_which_is_wrong_both_stay_and_are_doubtful():
+def test_where_nothing_shows_the_wrong_one_both_stay_and_are_doubtful():
     problem = lines(7)
     jacobian = problem.jacobian.copy()
     jacobian[2:, :, 3:] = 0.0

@@ -122,7 +122,7 @@ def test_places_follow_their_stated_covariance(draws):
     assert 0.4 < np.mean(surprises) < 2.0
 
 
-def test_views_from_several_sides_tell_how_large_a_target_is():
+def test_views_from_several_sides_show_the_size_of_a_target():
     surprises, sigmas = [], []
     for seed in range(8):
         cell, calibration = calibrated(IN_HAND, seed % 4)

@@ -368,7 +368,7 @@ def test_features_need_their_kinds(tmp_path, tool_file):
     run(KINDS, "--cad", cad_file(tmp_path / "cad.csv")).refused("Leave --cad away")
 
 
-def test_units_of_the_drawing(tmp_path, tool_file):
+def test_units_of_the_drawing_are_read(tmp_path, tool_file):
     touches = touches_file(tmp_path / "touches.csv")
 
     def run(columns, *more):
@@ -488,7 +488,7 @@ def test_a_frame_is_taken_out_again(tmp_path):
     visioncal("tcp", "--name", "gripper", "--remove").refused("Name where it is with -c or -o")
 
 
-def test_five_real_touches(real_data):
+def test_five_real_touches_determine_a_tip(real_data):
     done = visioncal("tcp", real_data / "tcp_pivot_rvbust/poses.csv", "--json")
     tool = found(done)
     # Figures of a plain linear fit by others, as they round them.
@@ -500,7 +500,7 @@ def test_five_real_touches(real_data):
     assert not tool["oriented"]
 
 
-def test_the_tip_and_its_rotation(tmp_path):
+def test_the_tip_and_its_rotation_are_found(tmp_path):
     made = touched(Job(axes=3), 1)
     done = tcp(tmp_path, made.touches, "--json")
     tool = found(done)
@@ -533,7 +533,7 @@ def test_several_points_need_fewer_touches_of_each(tmp_path):
     assert set(tool["details"]["points_m"]) == {"A", "B", "C"}
 
 
-def test_poses_in_other_forms(tmp_path):
+def test_poses_in_other_forms_are_read(tmp_path):
     poses = touched(Job(), 3).touches.base_from_flange
     turns = Rotation.from_matrix(poses[:, :3, :3])
     path, mm = tmp_path / "touches.csv", 1e3 * poses[:, :3, 3]

@@ -91,7 +91,7 @@ def test_the_exported_transform_is_read_back(name):
 
 
 @pytest.mark.parametrize("name", ANY_EDGE)
-def test_any_edge_and_frame_and_its_inverse(name):
+def test_any_edge_and_frame_and_its_inverse_are_exported(name):
     edges = {edge: found.matrix for edge, found in SAMPLE.edges.items()}
     frames = {TOOL: FLANGE_FROM_TOOL, FIXTURE: BASE_FROM_FIXTURE}
     for source, there in ((SAMPLE, edges), (CELL, frames), (ALONE, frames)):
@@ -200,7 +200,7 @@ def test_the_covariance_goes_to_the_frame_beside_the_optical_one():
     assert edge.sigma_mm < 0.5 * sampled_mm
 
 
-def test_a_body_is_no_camera_and_keeps_the_lens_of_one():
+def test_a_frame_of_a_cameras_body_keeps_its_lens():
     for name in ("ros", "mujoco", "text"):
         text = export(SAMPLE, name, of_the_body(BODY))
         assert "goes with the lens" in text
@@ -543,7 +543,7 @@ def rounded(text, mark):
     return re.sub(r"-?(\d+\.?\d*|\.\d+)", lambda pair: f"{float(pair[0]):.3f}", plain)
 
 
-def test_abb_gripper_of_the_manual():
+def test_the_gripper_of_abbs_manual_is_written_as_printed():
     # In the manual's words: turned by 45 deg, 223.1 mm straight out and 97.4 mm along x, 5 kg.
     matrix = readers.transform(readers.ry(np.pi / 4), [0.0974, 0, 0.2231])
     # The manual's quaternion has three digits, by which a matrix is off by up to four times that.
@@ -558,7 +558,7 @@ def test_abb_gripper_of_the_manual():
     assert np.abs(np.subtract(quaternion, theirs[1][1])).max() < 5e-4
 
 
-def test_abb_work_object_of_the_manual():
+def test_the_work_object_of_abbs_manual_is_written_as_printed():
     # Rounding of doubles.
     assert off("abb-wobjdata", WOBJ2, readers.transform(np.eye(3), [0.3, 0.8, 0.23])) < 1e-12
     user = readers.transform(np.eye(3), [0.3, 0.6, 0.2])
@@ -568,7 +568,7 @@ def test_abb_work_object_of_the_manual():
     assert readers.rapid(ours) == (kind, name, [*value[:4], [[0, 0, 0], [1, 0, 0, 0]]])
 
 
-def test_ur_tool_and_pose_of_the_script_manual():
+def test_tool_and_pose_of_urs_script_manual_are_written_as_printed():
     matrix = readers.transform(readers.of_rotation_vector(0, 3.14, 0), [0, 0.2, 0.3])
     # Rounding of doubles.
     assert off("ur-tcp", SET_TCP, matrix) < 1e-12
@@ -582,7 +582,7 @@ def test_ur_tool_and_pose_of_the_script_manual():
 @pytest.mark.parametrize(
     ("name", "theirs", "number"), [("kuka-tool", TOOL_DATA, 3), ("kuka-base", BASE_DATA, 1)]
 )
-def test_kuka_frames_of_a_controllers_own_file(name, theirs, number):
+def test_kuka_frames_of_a_controllers_file_are_written_as_there(name, theirs, number):
     matrix = FRAME_READERS[name](theirs)
     frames = tool(matrix) if name == "kuka-tool" else fixture(matrix)
     ours = export(placed.alone(frames), name, Selection(number=number))
@@ -628,7 +628,7 @@ P[1]{
 """
 
 
-def test_fanuc_frames_of_a_program_that_a_controller_printed():
+def test_fanuc_frames_of_a_controllers_program_are_written_as_there():
     theirs = readers.fanuc_program(SETUP_FRAMES)
     assert theirs["UTOOL[2]"][:3, 3].tolist() == [0, 0, 0.15]
     long = placed.frame(theirs["UTOOL[2]"], oriented=False)
@@ -729,7 +729,7 @@ def test_a_result_that_cannot_be_exported_is_refused(source, name, chosen, words
 
 
 @pytest.mark.parametrize("name", ["camera-info", "kalibr"])
-def test_a_lens_that_is_not_there_is_named_with_what_can_be_exported(name):
+def test_an_absent_lens_is_named_with_the_possible_exports(name):
     refused = raised(DataError, "measured poses", export, replace(SAMPLE, camera=None), name)
     assert refused.culprits == ("calibration.json: camera",)
     (can,) = re.findall("--to ([a-z]+)", refused.next_step)
@@ -833,7 +833,7 @@ CASE = Path(__file__).parents[3] / "shared/data/field/cases/camera-link-export/c
 
 
 @pytest.mark.skipif(not CASE.is_file(), reason="the case is not beside this checkout")
-def test_the_case_of_public_threads(tmp_path):
+def test_cases_of_public_threads_are_answered(tmp_path):
     SAMPLE.save(tmp_path / "calibration.json")
     told = CASE.read_text(encoding="utf-8")
     xyz, rpy = (

@@ -268,7 +268,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_intrinsics_of_others(tmp_path, name):
+def test_intrinsics_of_other_programs_are_read(tmp_path, name):
     (tmp_path / name).write_text(LENSES[name])
     lens, notes = read_intrinsics(tmp_path / name)
     assert not notes
@@ -279,7 +279,7 @@ def test_intrinsics_of_others(tmp_path, name):
     assert lens["resolution"] == [640, 480]
 
 
-def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
+def test_intrinsics_of_numpy_and_of_a_fisheye_are_read(tmp_path):
     matrix = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
     np.savez(tmp_path / "lens.npz", cameraMatrix=matrix, distCoeffs=[[-0.25, 0.125, 0, 0, 0.5]])
     assert read_intrinsics(tmp_path / "lens.npz")[0]["distortion"] == [-0.25, 0.125, 0, 0, 0.5]
@@ -452,7 +452,7 @@ def test_the_names_of_makers_are_known(logged, form, names):
 
 
 @pytest.mark.parametrize("form", ["franka", "matrix-transposed", "matrix", None])
-def test_sixteen_numbers_are_by_columns_where_they_say_so(logged, form):
+def test_sixteen_numbers_are_read_by_columns_where_stated(logged, form):
     names = tuple(f"m{at}" for at in range(16))
     by_columns = BASE_FROM_FLANGE.transpose(0, 2, 1).reshape(-1, 16)
     source = logged(",".join(names), by_columns.tolist())
@@ -674,7 +674,7 @@ OUTSIDE = {
 
 
 @pytest.mark.parametrize("name", OUTSIDE.values(), ids=OUTSIDE.keys())
-def test_names_of_images_that_are_refused(tmp_path, name):
+def test_forbidden_names_of_images_are_refused(tmp_path, name):
     raised(DataError, "or leaves the folder", images_named, [name], tmp_path)
 
 
@@ -750,7 +750,7 @@ def content(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_there_and_back_again(folder, tmp_path):
+def test_a_session_survives_the_way_to_a_recording_and_back(folder, tmp_path):
     recording, again = tmp_path / "cell.rrd", tmp_path / "again"
     convert(folder, recording)
     convert(recording, again)

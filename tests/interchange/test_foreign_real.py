@@ -74,7 +74,7 @@ def away_mm(calibration, edge, millimetres):
 
 
 @pytest.mark.slow
-def test_industrial_calibration(real_data, calibrated):
+def test_data_of_industrial_calibration_are_calibrated(real_data, calibrated):
     result, _ = calibrated(
         real_data / "ric_charuco_eye_to_hand",
         "--images",
@@ -99,7 +99,7 @@ def test_industrial_calibration(real_data, calibrated):
 
 
 @pytest.mark.slow
-def test_visp_to_the_hand(real_data, calibrated):
+def test_visps_data_of_a_carried_board_are_calibrated(real_data, calibrated):
     result, said = calibrated(
         real_data / "visp_franka_hand_eye/data-eye-to-hand",
         "--target",
@@ -141,7 +141,7 @@ def test_pose_pairs_give_what_opencv_gets_of_them(
     assert result.rms.mm <= rms_mm
 
 
-def test_moveit_with_a_published_answer(real_data, calibrated, tmp_path):
+def test_samples_of_moveit_give_the_published_answer(real_data, calibrated, tmp_path):
     result, _ = calibrated(
         real_data / "pose_pairs_small/moveit_eye_to_hand_50.json", "--mount", "eye-to-hand"
     )
@@ -175,7 +175,7 @@ def test_two_streams_by_two_clocks_are_joined(real_data, calibrated):
 
 
 @pytest.mark.slow
-def test_a_positioner_from_its_joints(real_data, calibrated, tmp_path):
+def test_a_positioner_is_calibrated_from_its_joints(real_data, calibrated, tmp_path):
     (tmp_path / "positioner.toml").write_text(POSITIONER)
     result, _ = calibrated(
         real_data / "ric_positioner_camera_kinematics/measurements.yaml",
@@ -206,7 +206,7 @@ def test_a_calibrated_positioner_predicts_views_that_no_fit_has_seen(real_data, 
 
 
 @pytest.mark.slow
-def test_a_ur10_from_its_joints(real_data, calibrated):
+def test_a_ur10_is_calibrated_from_its_joints(real_data, calibrated):
     joints = "shoulder_pan_joint,shoulder_lift_joint,elbow_joint,wrist_1_joint,wrist_2_joint"
     result, _ = calibrated(
         real_data / "figaroh_small/ur10_pose_calibration.csv",
@@ -235,7 +235,7 @@ def test_a_guess_finds_the_unstated_reading(real_data, tmp_path):
     assert visioncal.calibrate(tmp_path / "s").rms.mm < 5
 
 
-def test_a_mount_that_poses_cannot_tell_is_asked_for(real_data, tmp_path):
+def test_a_mount_that_poses_do_not_determine_is_asked_for(real_data, tmp_path):
     # Its target faces the camera, so that the inverse of the camera's poses is a cell as well.
     source = real_data / "pose_pairs_small/moveit_eye_to_hand_50.json"
     convert(source, tmp_path / "s", "--guess", "--yes").refused(

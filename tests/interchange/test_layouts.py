@@ -1497,7 +1497,7 @@ def came_in(session):
     )
 
 
-def test_structures_and_cells_of_matlab(tmp_path):
+def test_structures_and_cells_of_matlab_are_read(tmp_path):
     (robot, camera), mount = pairs()
     cells = np.empty((1, len(camera)), dtype=object)
     for at, pose in enumerate(camera):
@@ -1528,7 +1528,7 @@ def test_a_series_is_named_that_is_not_read(tmp_path, monkeypatch):
     np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
 
 
-def test_pictures_of_the_lens_beside_pairs_that_do_not_fit(tmp_path):
+def test_pictures_of_the_lens_do_not_change_pairs_that_do_not_fit(tmp_path):
     """Pairs of which no reading fits come in as they are, whatever pictures may be theirs."""
     both, mount = pairs()
     for at in range(1, 14):
@@ -1580,7 +1580,7 @@ def test_series_of_pictures_in_several_files_are_converted_one_by_one(tmp_path):
     assert "Convert the files one by one" in error
 
 
-def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monkeypatch):
+def test_an_undeclared_board_is_the_one_that_the_images_show(tmp_path, monkeypatch):
     """From `calibrate` of a folder on, what is printed leads to a session."""
     monkeypatch.chdir(tmp_path)
     stems_with_depth(tmp_path / "in")
@@ -1595,7 +1595,7 @@ def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monk
 
 
 @pytest.mark.parametrize("has_matrices", [False, True])
-def test_rows_of_both_sides_in_turn_without_names(tmp_path, has_matrices):
+def test_alternating_rows_of_both_sides_are_read_without_names(tmp_path, has_matrices):
     """Even and odd rows turn alike; of a pose that was written twice they are copies."""
     both, mount = pairs()
     quaternions = Rotation.from_matrix(both[..., :3, :3]).as_quat()
@@ -1625,7 +1625,7 @@ def test_angles_of_two_runs_are_no_sides(tmp_path):
 
 
 @pytest.mark.parametrize("names", [("g2b", "t2c"), ("b2e", "o2c")])
-def test_frames_by_their_initials(tmp_path, names):
+def test_poses_are_read_by_the_initials_of_their_frames(tmp_path, names):
     both, mount = pairs()
     robot = both[0] if names[0] == "g2b" else np.linalg.inv(both[0])
     arrays = {f"T_{names[1]}": both[1], f"T_{names[0]}": robot, "T_c2g": np.eye(4)}
@@ -1634,7 +1634,7 @@ def test_frames_by_their_initials(tmp_path, names):
     np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
 
 
-def test_points_of_a_camera_in_a_file_beside_the_robot_s_poses(tmp_path):
+def test_points_of_a_camera_are_read_from_a_file_beside_the_robot_s_poses(tmp_path):
     """A matrix a row and homogeneous points in files of any names; no command is needed."""
     poses, seen = pairs()[0]
     write(tmp_path / "in/rt.txt", "\n".join(" ".join(map(str, each.ravel())) for each in poses))
@@ -1682,13 +1682,13 @@ def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_on
         refused.refused("12 pairs of points without rotations, and no rigid motion maps")
 
 
-def test_arrays_without_rows(tmp_path):
+def test_arrays_without_rows_are_refused(tmp_path):
     np.savez(tmp_path / "in.npz", angles=np.zeros((0, 7)), poses=np.zeros((0, 4, 4)))
     error = visioncal("convert", tmp_path / "in.npz", tmp_path / "out").refused().err
     assert "in.npz has no list with one entry per pose: it is empty" in error
 
 
-def test_quaternions_without_their_real_part(tmp_path, monkeypatch):
+def test_quaternions_without_their_real_part_are_read(tmp_path, monkeypatch):
     """Three numbers of them are a form; half turns made of these are named as what they are."""
     monkeypatch.chdir(tmp_path)
     poses, _, session = world()
@@ -1715,7 +1715,7 @@ def test_quaternions_without_their_real_part(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("real", "at"), [("qs", 3), ("q_w", 3), ("rw", 0)])
-def test_a_real_part_of_another_name(tmp_path, real, at):
+def test_a_quaternions_real_part_is_found_under_any_name(tmp_path, real, at):
     """It makes quaternions of either sign unit ones, whatever its column is called."""
     both, mount = pairs()
     names, columns = [], []

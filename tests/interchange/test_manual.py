@@ -284,7 +284,7 @@ def a_file(path, rotations, form="kuka", images=True):
 
 
 @pytest.mark.parametrize("form", ["ur", "kuka", "abb", "doosan"])
-def test_a_file_with_a_pose_a_line_says_itself_what_it_means(tmp_path, form):
+def test_a_file_with_one_pose_per_line_states_its_form(tmp_path, form):
     rotations = CASES["any"][:4]
     for images in (True, False):
         fields = read_fields(a_file(tmp_path / "poses.txt", rotations, form, images))

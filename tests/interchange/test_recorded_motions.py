@@ -429,7 +429,7 @@ def test_messages_that_lie_are_refused(change, message, with_depth, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_frames_that_go_round_are_refused(with_depth, tmp_path):
+def test_frames_in_a_cycle_are_refused(with_depth, tmp_path):
     def change(kind, at, message):
         if kind == "TFMessage":
             names = ("a", "b") if at % 2 else ("b", "a")
@@ -440,7 +440,7 @@ def test_frames_that_go_round_are_refused(with_depth, tmp_path):
     raised(DataError, "go round", convert, path, tmp_path / "out", requested=BOARD)
 
 
-def test_poses_that_are_none_are_left_out(with_depth, tmp_path):
+def test_invalid_poses_are_left_out(with_depth, tmp_path):
     source = Session.load(with_depth)
     whole = convert(bag(tmp_path / "b", source, with_depth), tmp_path / "whole", requested=BOARD)
     # As tf2 does, of which a buffer keeps no such transform.

@@ -59,7 +59,7 @@ def recorded(out):
 
 
 @pytest.mark.parametrize("typed", [[], ["1 2 3"], ["0.1 0.2 0.3 0 0 0.1"]])
-def test_poses_that_were_none_leave_no_folder_in_the_way_of_the_next_ones(seen, tmp_path, typed):
+def test_malformed_poses_leave_no_folder_in_the_way_of_the_next_ones(seen, tmp_path, typed):
     lines, pictures = seen
     shown, live = tmp_path / "pictures", tmp_path / "live"
     shown.mkdir()

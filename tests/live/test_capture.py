@@ -199,7 +199,7 @@ def test_an_arm_that_hangs_or_ends_elsewhere_is_reported(plan, tmp_path):
         recorded(tmp_path / "elsewhere", plan, arm, camera)
 
 
-def test_ways_from_elsewhere_are_looked_at(plan):
+def test_ways_from_elsewhere_are_checked(plan):
     first, second = plan.stops[:2]
     assert len(checked_path(plan, first, first.q)) == 1
     assert np.array_equal(checked_path(plan, second, first.q)[-1], second.q)
@@ -440,7 +440,7 @@ def test_a_plan_is_read_back_as_it_was_made(planned):
     assert read.digest == document["inputs_sha256"]
 
 
-def test_a_plan_is_driven_and_told_line_by_line(planned, cell, tmp_path):
+def test_a_plan_is_driven_and_reported_line_by_line(planned, cell, tmp_path):
     done = record(tmp_path / "live", "--plan", planned[0], "--yes").good()
     assert "4 stops to drive at 0.4 rad/s, about" in done.err
     assert "the way is clear of all that was declared" in done.err

@@ -227,7 +227,7 @@ def test_a_device_without_that_camera_is_refused_and_let_go(monkeypatch):
     assert device.is_closed
 
 
-def test_without_a_device_it_tells_of_the_cable_and_the_rule(monkeypatch):
+def test_a_missing_device_is_reported_with_cable_and_rule(monkeypatch):
     def none(*_):
         raise RuntimeError("No available devices")
 

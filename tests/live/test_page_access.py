@@ -164,7 +164,7 @@ def test_no_text_becomes_code_of_the_page():
         "table.add_slot('body', '<td v-html=props.value>')",
     ],
 )
-def test_the_search_for_such_code_can_fail(code):
+def test_the_search_for_unsafe_code_can_fail(code):
     assert len([*faults_in(code)]) == 1
 
 

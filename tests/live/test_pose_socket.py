@@ -314,7 +314,7 @@ def test_a_robot_that_does_not_come_back_ends_the_recording():
         raised(DataError, "needs a port", open_arm, words, None, form=None, moves=False)
 
 
-def test_who_says_nothing_or_garbage_takes_no_robots_place(arm):
+def test_silent_and_garbled_clients_take_no_robots_place(arm):
     with contextlib.ExitStack() as stack:
         silent, half, garbage, robot = (stack.enter_context(client_of(arm)) for _ in range(4))
         half.sendall(b"1 | X 4")

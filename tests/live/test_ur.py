@@ -48,7 +48,7 @@ def stands(controller):
 
 
 @pytest.mark.usefixtures("patient")
-def test_an_arm_moves_tells_where_it_is_and_stops(controller):
+def test_an_arm_moves_reports_its_pose_and_stops(controller):
     with closing(UrArm(controller.host)) as arm:
         assert isinstance(arm, MovingArm)
         assert arm.name == f"UR10e at {controller.host}"

@@ -349,7 +349,7 @@ def test_the_stops_take_all_branches_of_the_arm():
 
 
 @pytest.mark.parametrize("robot", ["panda", "irb120"])
-def test_arms_of_other_makers_and_of_seven_joints(robot):
+def test_stops_are_found_for_arms_of_other_makers_and_of_seven_joints(robot):
     cell = cell_of(CellOptions(robot="ur5e"), robot=load_robot(robot))
     stops = candidates(cell, 30)
     assert stops.q.shape == (30, load_robot(robot).joint_count)
@@ -442,6 +442,6 @@ def test_an_arm_of_four_joints_finds_its_views_by_drawing_postures():
         lambda: replace(cell_of(CellOptions()), sigma_m=np.nan),
     ],
 )
-def test_a_cell_that_cannot_be_is_refused(make):
+def test_an_impossible_cell_is_refused(make):
     with pytest.raises(DataError):
         make()

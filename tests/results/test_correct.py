@@ -138,7 +138,7 @@ def test_the_controller_finds_the_joints_again_in_the_pose(result):
     assert reached == pytest.approx(sent.wanted, abs=1e-9)
 
 
-def test_one_target_or_many_as_matrices_or_transforms(result):
+def test_targets_are_one_or_many_matrices_or_transforms(result):
     flange = targets_near(3, result)
     many = visioncal.correct(result, flange, joints_near(3))
     one = visioncal.correct(result, flange[1], joints_near(3)[1])
@@ -169,7 +169,7 @@ def test_each_target_follows_the_one_before_it(result):
     assert np.array_equal(visioncal.correct(result, line, seeds).q, path.q)
 
 
-def test_without_a_seed_it_is_the_posture_nearest_to_the_middle(result):
+def test_without_a_seed_the_posture_is_nearest_to_the_middle(result):
     flange = targets_near(1, result)
     free = visioncal.correct(result, flange)
     others = [

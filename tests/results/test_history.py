@@ -110,7 +110,7 @@ def test_entries_are_only_appended(tmp_path):
     assert found.edges["flange_from_cam"].covariance.tolist() == (1e-8 * np.eye(6)).tolist()
 
 
-def test_files_of_other_versions(tmp_path, monkeypatch):
+def test_files_of_other_versions_are_upgraded_or_refused(tmp_path, monkeypatch):
     """An older one is brought forward with its entries, a newer one is refused in words."""
     history = History(tmp_path / "history.db")
     history.append(entry(1))
@@ -135,7 +135,7 @@ def refused(path, *words, reading=False):
         assert expected in caught.value.message, caught.value.message
 
 
-def test_files_that_cannot_be_used(tmp_path, monkeypatch):
+def test_unusable_files_are_refused(tmp_path, monkeypatch):
     history = History(tmp_path / "history.db")
     history.append(entry(1))
     monkeypatch.setattr(module, "_PATIENCE_S", 0.1)
@@ -213,7 +213,7 @@ def test_a_full_disk_takes_nothing_away(tmp_path):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody with fewer rights")
-def test_a_read_only_place():
+def test_a_history_in_a_read_only_folder_can_be_read():
     with tempfile.TemporaryDirectory() as folder:
         history = History(Path(folder) / "history.db")
         history.append(entry(1))

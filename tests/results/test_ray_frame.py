@@ -18,7 +18,7 @@ NAME = "flange_from_cam"
 SAMPLE = made_up(4).calibration
 
 
-def test_its_covariance_agrees_with_central_differences():
+def test_covariance_of_the_ray_frame_agrees_with_central_differences():
     calibration = with_field(SAMPLE)
     error = an_error(calibration, seed=1)
     found = with_error(calibration, error).ray_frame.transform

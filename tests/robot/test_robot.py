@@ -306,7 +306,7 @@ def test_corrections_are_as_stated():
 
 
 @pytest.mark.parametrize("robot", [load_robot("panda"), of_urdf()], ids=["panda", "urdf"])
-def test_a_corrected_robot_stands_alone(robot, tmp_path):
+def test_a_corrected_robot_is_described_by_its_document_alone(robot, tmp_path):
     corrected = other(robot)
     again = Robot.from_document(json.loads(json.dumps(corrected.document)))
     name, content = robot_file(corrected.document)
@@ -330,7 +330,7 @@ def test_corrections_that_a_urdf_cannot_hold_are_named():
         assert "Not in this file" in text
         assert "turn: ratio " in text
         Robot.from_document({"schema": 1, "name": "x", "tip": "flange", "urdf": text})
-    raised(DataError, "must be one of a URDF", corrected_urdf, load_robot("ur5"), load_robot("ur5"))
+    raised(DataError, "must come from a URDF", corrected_urdf, load_robot("ur5"), load_robot("ur5"))
 
 
 # What ur_description's config/ur5e/default_kinematics.yaml holds, pi / 2 in full.
@@ -394,7 +394,7 @@ def test_their_jacobian_is_that_of_the_forward_kinematics(wavy):
     np.testing.assert_allclose(wavy.harmonic_jacobian(q, 7), slopes, rtol=0, atol=1e-8)
 
 
-def test_encoders_tell_again_where_the_joints_stand(wavy):
+def test_encoder_angles_invert_joint_functions(wavy):
     q = some_joints(wavy)
     # Newton's last step squares what it was off by.
     np.testing.assert_allclose(wavy.chain.encoded(wavy.chain.effective(q)), q, atol=1e-13)

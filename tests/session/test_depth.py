@@ -100,7 +100,7 @@ def test_pictures_are_in_the_stated_unit_and_have_holes(cloud):
     assert np.allclose(read_depth(tiff(metres), "a.tiff", SIZE), metres, 0, 1e-12, True)
 
 
-def test_pictures_of_numpy_and_the_largest_number_as_a_hole(cloud):
+def test_pictures_of_numpy_are_read_with_the_largest_number_as_a_hole(cloud):
     metres = cloud[..., 2].astype(np.float32)
     assert np.allclose(read_depth(npy(metres), "a.npy", SIZE), metres, 0, 1e-12, True)
     millimetres = np.where(np.isfinite(metres), np.nan_to_num(1e3 * metres), 65535).astype("u2")

@@ -125,7 +125,7 @@ def test_a_row_with_another_pose_than_its_stop_is_of_a_state_of_its_own(folder):
     assert found[0] == found[1] != found[2]
 
 
-def test_every_storage_of_it_is_the_same_session(folder, tmp_path):
+def test_every_stored_form_is_the_same_session(folder, tmp_path):
     session = Session.load(folder)
     session.save(tmp_path / "copy")
     write_recording(tmp_path / "cell.rrd", session, None, (), None)

@@ -151,7 +151,7 @@ def test_the_digest_knows_streams_and_is_as_it_was_without():
         ("qx", "1e308", "beyond every number of a cell"),
     ],
 )
-def test_a_number_that_no_cell_has_is_named_by_its_column(column, value, words, tmp_path):
+def test_an_impossible_number_is_named_by_its_column(column, value, words, tmp_path):
     names = ("stamp_s", *POSE, "q1_rad", "dq1_rad_s", "tau1_nm", "note")
     cells = dict.fromkeys(names, "0") | {"qw": "1"}
     first, second = cells, cells | {"stamp_s": "1"} | {column: value}

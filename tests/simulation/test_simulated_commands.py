@@ -151,7 +151,7 @@ def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
         assert misfit(edge, edges[f"point_{robot}1"], among) < MOST
 
 
-def test_a_file_of_ones_own_says_what_a_cell_is_made_of(place):
+def test_a_users_file_describes_a_cell(place):
     (place / "own.toml").write_text(OWN + PUSHED)
     cell = simulate(read_cell(str(place / "own.toml")))
     assert [robot.robot for robot in cell.options.robots] == ["ur10e"]

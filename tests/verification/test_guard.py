@@ -285,7 +285,7 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
     raised(DataError, "holds no fit", Guard, without)
 
 
-def test_of_the_command_line(tmp_path, monkeypatch):
+def test_mistakes_at_the_command_line_are_refused(tmp_path, monkeypatch):
     place, rng = usual("eye-in-hand"), np.random.default_rng(4)
     place.calibration.save(tmp_path / "calibration.json")
     against = ("--against", tmp_path, "--state", tmp_path / "state.json")
@@ -380,7 +380,7 @@ def test_turns_are_within_their_covariance(lights):
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
 
 
-def test_images_that_say_nothing_are_named(lights):
+def test_images_without_information_are_named(lights):
     """None is a shift by accident."""
     rng = np.random.default_rng(1)
     reference = disturbed(lights[0][0], rng, 0.0, (1.0, 1.0))

@@ -53,7 +53,7 @@ def moves(shown, **options):
 
 
 @pytest.mark.slow
-def test_a_camera_that_stands_is_not_accused(lights):
+def test_a_camera_that_stood_still_is_not_accused(lights):
     # Noise, light and an arm that moves are in every frame.
     assert moves(episodes(lights, [[0] * LENGTH] * 4)) == []
 

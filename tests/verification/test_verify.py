@@ -599,7 +599,7 @@ def test_an_act_ends_where_nothing_changed_and_where_the_proof_fails(cell, tmp_p
 
 
 @pytest.mark.parametrize(("what", "mount"), crossed(["camera", "board"], MOUNTS))
-def test_half_a_turn_is_no_metre(what, mount):
+def test_a_change_by_half_a_turn_is_found_without_a_shift_of_metres(what, mount):
     """By poses of the target, as a camera that is turned so far sees none in its image."""
     cell, rng = simulate(CellOptions(views=20, mount=mount)), np.random.default_rng(2)
     calibration = calibrate(pairs_session(mount, cell.robot.base_from_flange, cell.cam_from_target))

@@ -158,7 +158,7 @@ def test_every_unusable_view_gets_its_reason(charuco):
         assert word in rejection.reason
 
 
-def test_too_few_corners_and_corners_on_one_line(charuco, monkeypatch):
+def test_too_few_corners_and_corners_on_one_line_are_no_board(charuco, monkeypatch):
     cell, images = charuco
     target = cell.options.target
     seen = find_target(images[0], target)
@@ -533,7 +533,7 @@ def outlined(monkeypatch):
     return images
 
 
-def test_outlines_of_squares_are_looked_for_in_a_small_copy(outlined):
+def test_outlines_of_squares_are_searched_in_a_small_copy(outlined):
     """In the noise of a whole image of many pixels the search takes most of a minute."""
     image = np.full((1500, 2400), 235, dtype=np.uint8)
     squares = 210 * (np.indices((5, 7)).sum(axis=0) % 2) + 20
@@ -546,7 +546,7 @@ def test_outlines_of_squares_are_looked_for_in_a_small_copy(outlined):
     assert max(image.shape[1] for image in outlined) <= 1500
 
 
-def test_outlines_of_small_squares_are_looked_for_in_the_whole_image(outlined):
+def test_outlines_of_small_squares_are_searched_in_the_whole_image(outlined):
     """As of 16 px in 1920 x 1080, among less noise than the image has."""
     rng = np.random.default_rng(0)
     squares = 200.0 * (np.indices((7, 9)).sum(axis=0) % 2) + 20.0

@@ -89,7 +89,7 @@ def test_weights_in_the_cache_are_used_and_others_refused(tmp_path, monkeypatch)
         light_glue(file)
 
 
-def test_weights_are_looked_for_where_they_are_named_and_nowhere_else(tmp_path, monkeypatch):
+def test_weights_are_searched_where_they_are_named_and_nowhere_else(tmp_path, monkeypatch):
     monkeypatch.setattr(matching, "is_installed", lambda: False)
     with pytest.raises(DataError, match="kornia's, which is not installed"):
         matching.check_weights(tmp_path)
@@ -153,7 +153,7 @@ def test_a_picture_is_found_by_other_matches_where_its_own_fail(monkeypatch):
 
 
 @pytest.mark.slow
-def test_nothing_of_it_is_imported_without_a_picture():
+def test_no_matcher_is_imported_without_a_picture():
     code = (
         "import sys, visioncal.calibration.run, visioncal.vision.boards; "
         "heavy = ('torch', 'kornia', 'visioncal.vision.register', 'visioncal.vision.patches', "

@@ -247,7 +247,7 @@ def test_corners_are_numbered_by_their_tags():
         ({"marker_id": 30}, r"most tags seen \(0, 1, 2, 3, 4\) are none of the target's"),
     ],
 )
-def test_another_page_is_named(change, words):
+def test_another_print_of_a_grid_of_tags_is_named(change, words):
     image = np.pad(photograph(TAG_GRID, SHOT, 2)[0], 60, constant_values=210)
     found = find_target(image, replace(TAG_GRID, **change))
     assert isinstance(found, NotFound)
@@ -332,7 +332,7 @@ def test_records_of_other_boards_are_no_checkerboard(tmp_path, text):
     raised(DataError, "target_type", load_target, tmp_path / "board.json")
 
 
-def test_the_grid_of_a_kalibr_target_in_one_word():
+def test_the_grid_of_a_kalibr_target_is_described_in_one_word():
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
     assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected
 

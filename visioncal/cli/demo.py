@@ -118,7 +118,7 @@ def demo_command(options: DemoOptions) -> None:
     squared, limit = chi_square(done.calibration, truth)
     verb = "is explained by" if squared <= limit else "is more than"
     answer(
-        f"the error {verb} the sigmas: chi-square {squared:.1f}, and up to {limit:.0f} is believed"
+        f"the error {verb} the sigmas: chi-square {squared:.1f}, and up to {limit:.0f} is expected"
     )
     for file in (session, truth_path(session)):
         say(f"wrote {file}")

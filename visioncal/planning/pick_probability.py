@@ -126,7 +126,7 @@ def check_need(need: Need, judged: str) -> None:
             )
     if judged != "sight":
         raise DataError(
-            "a need is of picks by what the camera sees, and these stops are for the arm.",
+            "a need is of picks by the camera, and these stops are for the arm.",
             culprits=["need"],
             next_step="Plan for hand-eye, or leave the need out.",
         )

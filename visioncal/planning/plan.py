@@ -221,8 +221,7 @@ class _Planning:
                 raise DataError(
                     f"plan: by what was recorded, {chance} of picks land within "
                     f"{words_of(request.need)}; no stop needs to be added.",
-                    next_step="Need less than that, or leave the need out to see what stops would "
-                    "give.",
+                    next_step="State a smaller need, or leave it out to see what stops would give.",
                 )
             # Fewer stops may be informative enough, but would not reveal an outlier among them.
             fewest = max(fewest, needed_stops)

@@ -244,7 +244,7 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
     text = nominal.document.get("urdf")
     if not isinstance(text, str) or nominal.joint_names != corrected.joint_names:
         raise DataError(
-            f"robot {nominal.name} must be one of a URDF, with its corrected model.",
+            f"robot {nominal.name} must come from a URDF, with its corrected model.",
             culprits=[nominal.name],
             next_step="Write a small URDF or a joint table instead.",
         )
@@ -358,7 +358,7 @@ def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = 
     text = robot.document.get("urdf")
     if not isinstance(text, str):
         raise DataError(
-            f"robot {robot.name} must be one of a URDF.",
+            f"robot {robot.name} must come from a URDF.",
             culprits=[robot.name],
             next_step="Write a small URDF or a joint table instead.",
         )

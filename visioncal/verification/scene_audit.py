@@ -112,8 +112,8 @@ def scene_moves(
             places, lost, used = [here], [], used + 1
     if used < 2:
         raise DataError(
-            f"{used} frames of {last} episodes could be compared with an earlier one; two must be. "
-            "The others show other things, or too little.",
+            f"{used} frames of {last} episodes could be compared with an earlier one, "
+            "but two are needed: the others show other things, or too little.",
             next_step="Audit a camera that stands still before the same scene, one at a time: "
             "--image-key; of one that moves with the arm, visioncal verify and guard do it.",
         )

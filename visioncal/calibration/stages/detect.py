@@ -217,7 +217,7 @@ def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Sea
 
 
 def other_sizes(detections: Detections) -> Iterator[Finding]:
-    """The finding on images that are turned by a quarter or scaled, beside those of the camera."""
+    """The finding on images that are turned by a quarter or scaled against the camera's."""
     usual = detections.resolution
     sizes = {view: at.size for view, at in detections.searches.items() if at.size is not None}
     odd = [

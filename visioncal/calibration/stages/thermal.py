@@ -95,7 +95,7 @@ class HeatedStops:
             raise DegenerateError(
                 f"thermal: the joints warm up by at most {figure(rise_k)} K in the "
                 f"{figure((most_s - least_s) / 3600.0)} h of the {len(self.q)} used stops, but "
-                f"must by {LEAST_RISE_K:g} K: the views do not show how the arm drifts.",
+                f"{LEAST_RISE_K:g} K are needed: the views do not show how the arm drifts.",
                 culprits=["temperatures"],
                 next_step="Begin with a cold robot, let it work for an hour or more, and look at "
                 "the same few reference views every five to ten minutes.",

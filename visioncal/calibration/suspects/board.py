@@ -184,8 +184,8 @@ def _stretched(found: Finding, fitted: Fit, board: tuple[str, str], called: str)
         words=f"By the robot's motion the {called} is {' and '.join(by)} than stated, as where a "
         "printer stretches one axis. The result goes by both.",
         do=Remedy(
-            "Print it on another printer, and measure it along both axes; one square_m is not "
-            "enough for this one, of which the result knows both."
+            "Print it on another printer, and measure it along both axes; one square_m does "
+            "not describe this one, of which the result has both sizes."
         ),
     )
 

@@ -347,8 +347,8 @@ def _lost_views(sensor: Sensor) -> Iterator[Finding]:
         step = Remedy(words, f"{CALIBRATE} --dense")
     yield Finding(
         "lost_views",
-        f"{count} of {total} views {'is' if count == 1 else 'are'} not used. The first but for "
-        f"outliers: view {others[0].view}, {others[0].reason}.",
+        f"{count} of {total} views {'is' if count == 1 else 'are'} not used. The first that is "
+        f"no outlier: view {others[0].view}, {others[0].reason}.",
         step,
         tuple(rejection.view for rejection in sensor.lost),
         is_fatal=share > bad,

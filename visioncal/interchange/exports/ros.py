@@ -153,7 +153,7 @@ def _write_oak(content: Content) -> str:
             f"oak: the device's own calibration is of {wide} x {high} pixels, and this lens of "
             f"{width} x {height}, which depthai takes for another part of the sensor.",
             culprits=["--onto"],
-            next_step="Calibrate with pictures of the shape of the device's calibration.",
+            next_step="Calibrate with pictures of the proportions of the device's calibration.",
         )
     scale, matrix = max(width / wide, height / high), matrix_3x3(camera)
     matrix[:2, 2] += 0.5 * np.array([wide * scale - width, high * scale - height])
