@@ -297,7 +297,7 @@ def test_two_readings_that_close_alike_are_both_named_and_none_is_taken(tmp_path
     guess = guessed(replace(poses, robot=numbers(wrong)))
     assert guess.is_open
     assert not guess.stands_out
-    assert "Nothing tells between these" in guess.sentence
+    assert "Nothing decides between these" in guess.sentence
     assert "y, z, w, x" in guess.sentence
     assert "positions taken as" in guess.sentence
     session = pairs_session(poses.mount, wrong, poses.camera.poses())

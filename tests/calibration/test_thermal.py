@@ -339,7 +339,10 @@ def test_sessions_in_which_nothing_warms_up_are_refused():
     still = WarmUpOptions(CELL, heat, Round(minutes=30.0), hours=0.6)
     short = Round(minutes=4.0, every_s=120.0)
     soon = WarmUpOptions(CELL, round=short, hours=0.1, temperatures=False)
-    for how, words in ((soon, "must by .* K"), (still, r"warm up by at most .* K in the 0\.42 h")):
+    for how, words in (
+        (soon, "K are needed"),
+        (still, r"warm up by at most .* K in the 0\.42 h"),
+    ):
         session = cell_session(simulate_warm_up(how), "cold", seen="poses")
         refused = raised(DegenerateError, words, calibrate, session, level="thermal")
     assert "cold robot" in refused.next_step

@@ -736,7 +736,7 @@ def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks
         (
             {"lost": LOST},
             "check",
-            "10 of 30 views are not used. The first that is no outlier: view ",
+            "views are not used. The first that is no outlier: view ",
         ),
         ({"pixel_px": 1.0}, "check", "Corners deviate by 1 px"),
         ({"warnings": remarks(("It is upside down.",))}, "check", "It is upside down."),

@@ -226,7 +226,7 @@ def _confined(
             if (is_right and is_inside) or value in (*stated, *choices):
                 continue
         raise DataError(
-            f"{label}: {value[:80]!r} is not below {site}, to which a page on a network is kept.",
+            f"{label}: {value[:80]!r} is not below {site}, to which a networked page is kept.",
             culprits=[value[:80]],
             next_step="Start the command in a folder above it, or name it there with --camera, "
             "--target or --robot.",

@@ -90,7 +90,7 @@ def plan_instrument(options: PlanOptions, source: Source, kept: Kept) -> str:
             answer(line)
         if plan.condition() >= STABLE:
             warn(
-                "the stops leave parameters that can hardly be told apart: ask for more of them, "
+                "the stops leave parameters that are hardly separated: ask for more of them, "
                 "or read a 6D probe (--probe pose)"
             )
         say(

@@ -222,7 +222,7 @@ def _recorded(options: RecoverOptions, act: _Act, path: Path) -> Session:
 
 
 def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:
-    """Says what cannot be told apart, or not recovered, and exits."""
+    """Names causes that are not separated, or not recovered, and exits."""
     kinds = ("camera", "board", "joint")
     alike = [[change.name] for change in check.named if change.cause.kind in kinds]
     how = "Look which of them it is, and say so:"

@@ -41,7 +41,7 @@ def mm_and_deg(mm: float, deg: float) -> str:
 
 
 def sigma_words(sigma: float, unit: str) -> str:
-    """Formats a sigma in mm or deg; one beyond ten metres or half a turn tells nothing."""
+    """Formats a sigma in mm or deg; one beyond ten metres or half a turn means nothing."""
     most = 1e4 if unit == "mm" else 180.0
     return f"{figure(sigma)} {unit}" if sigma < most else f"not determined ({unit})"
 

@@ -182,7 +182,7 @@ def start_lenses(cell: Cell, known: Mapping[str, Camera]) -> dict[str, Camera]:
 
 
 def _by_corners(cell: Cell, frame: str, table: CameraTable) -> Camera:
-    """A lens by the corners of some images; one of no focal length where these tell nothing."""
+    """A lens by the corners of some images; without a focal length where these determine none."""
     seen = {at: s for at, s in enumerate(cell.sightings) if s.seer == frame and s.corners}
     # Corners on a line, or a few beside many, mislead the closed form of focal lengths.
     typical = np.median([len(s.corners.ids) for s in seen.values() if s.corners])

@@ -272,7 +272,7 @@ def _findings(
     yield from bad
     changed = [edge.name for edge in edges if edge.is_change]
     if bad:
-        yield "Whether camera or board moved, a bad result does not tell."
+        yield "Whether camera or board moved, a bad result does not show."
     elif a.cell is not None:
         frames = some_of([name.partition("_from_")[2] for name in changed])
         yield (

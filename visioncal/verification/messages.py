@@ -131,7 +131,7 @@ def verdict_of(check: Check) -> Verdict:
         step = Remedy("Correct that first, and calibrate again: changes from it say little.")
         bad.append(Finding("bad_calibration", words, step))
     if check.predicted.stops < CheckLimits.stops:
-        words = f"{_stops(check)} can hardly tell one change from another."
+        words = f"{_stops(check)} can hardly distinguish one change from another."
         step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
         few.append(Finding("few_stops", words, step))
     if not check.named:

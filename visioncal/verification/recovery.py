@@ -63,8 +63,8 @@ def parted(session: Session) -> tuple[Session, Session]:
     if len(stops) < _LIMITS.fewest:
         raise DataError(
             f"session {session.name!r} has {counted(len(stops), 'stop')}, and {_LIMITS.fewest} are "
-            "needed: a third is held back for the proof, and fewer than the others hardly tell one "
-            "change from another.",
+            "needed: a third is held back for the proof, and fewer than the others hardly "
+            "distinguish one change from another.",
             culprits=[session.name],
             next_step="Record more of them.",
         )
@@ -135,7 +135,7 @@ def recover(
     doubts = () if new.verdict.status == "good" else new.verdict.findings
     doubts = tuple(replace(doubt, do=None) for doubt in doubts)
     rivals = [
-        f"Stops cannot tell whether the {side} moved instead, which targets, tools and fixtures of "
+        f"Stops cannot show whether the {side} moved instead, which targets, tools and fixtures of "
         f"that side have to follow: if it did, say --cause {side}."
         for side in sorted({*along(old, causes)} - {*causes})
     ]

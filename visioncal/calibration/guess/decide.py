@@ -291,7 +291,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
         )
         listed = "; or with ".join(words)
         return (
-            f"Robot and camera agree with {listed}. Nothing tells between these. As first read, "
+            f"Robot and camera agree with {listed}. Nothing decides between these. As first read, "
             f"they agree to {_figures(declared)}."
         )
     if not declared.fit.closes:

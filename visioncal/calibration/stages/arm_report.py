@@ -203,7 +203,7 @@ def _mistyped(
     if not far or any(name in far[0][0].name for name, *_ in _FAR_OFF):
         return
     first, *others = (_off(*each, table, robot) for each in far)
-    either = f" Or {' or '.join(others)}: these stops do not tell them apart." if others else ""
+    either = f" Or {' or '.join(others)}: these stops do not separate them." if others else ""
     words = (
         f"{first[0].upper()}{first[1:]}. This alone explains what the arm errs by: beside it, its "
         f"other parameters are off by {100.0 * far[0][1].rest:.0f} % of what they are without."

@@ -325,7 +325,7 @@ class RobotArm:
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 
     def _hypotheses(self, loads: Loads) -> Iterator[Robot]:
-        """The arm as stated; where loads could tell, also with its weight compensated."""
+        """The arm as stated; where loads could show it, also with its weight compensated."""
         if self.matched is None:
             return
         # Of functions of the joints only that arm is tried which the loads have shown.

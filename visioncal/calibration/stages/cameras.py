@@ -182,7 +182,7 @@ def _with_dense(
 
 
 def _predicted(first: Observed, views: Collection[int]) -> dict[int, tuple[Camera, FloatArray]]:
-    """Lenses and (4, 4) poses of boards in some views, where a fit of the others tells them."""
+    """Lenses and (4, 4) poses of boards in some views, by a fit of the others if it has them."""
     if not views:
         return {}
     try:

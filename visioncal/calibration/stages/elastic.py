@@ -146,7 +146,7 @@ class _Slopes:
 
 
 def slopes_of(arm: ArmData) -> dict[int, TwoSlopes]:
-    """Joints that yield by another slope beyond some torque, by number; heavy loads alone tell."""
+    """Joints that yield by another slope beyond a torque, by number; only heavy loads show it."""
     model, loads = arm.model, arm.loads
     pull = loads.payload_kg * 9.81 + np.linalg.norm(loads.force_n, axis=1)
     if COMPLIANCE not in model.weights or pull.max(initial=0.0) < _HEAVY_N or len({*pull}) < 2:

@@ -214,7 +214,7 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
         location = "on one line" if spread_m[0] > 0.0 else "in one place"
         yield (
             f"has all points {location}",
-            "Give points beside these: no camera tells how they turn.",
+            "Give points beside these: no camera shows how they turn.",
         )
     extent_m = float(np.ptp(places_m, axis=0).max())
     if extent_m > FAR_M:
