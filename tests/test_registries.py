@@ -20,7 +20,7 @@ from visioncal.core.choices import POSE_FORMS
 from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats.registry import FOREIGN_FORMATS
 from visioncal.live.capture.devices import ARMS, CAMERAS
-from visioncal.model.effects import EFFECTS, NAMED
+from visioncal.model.effects import EFFECTS, NAMED, Effect
 from visioncal.vision.boards import KINDS
 
 ROOT = Path(__file__).parents[1]
@@ -172,8 +172,18 @@ def finding_faults(kinds):
             yield f"{kind}: raised in {place}, not in calibration/suspects/registry.py"
 
 
+def kinds_below(effect):
+    """Names of kinds that derive from a class of effects, in the package."""
+    for each in effect.__subclasses__():
+        if hasattr(each, "kind") and each.__module__.startswith("visioncal."):
+            yield each.kind
+        yield from kinds_below(each)
+
+
 def effect_faults(kinds, effects):
-    """Effects without a clause or a page, and named ones that are no suspect or in no test."""
+    """Effects without a clause, a page or an import, and named ones that are in no test."""
+    for kind in {*kinds_below(Effect)} - kinds.keys():
+        yield f"{kind}: not imported by model/effects/__init__.py, from which its clause is found"
     for kind, effect in kinds.items():
         if not hasattr(effect, "clause"):
             yield f"{kind}: no clause says what it does"
@@ -246,7 +256,8 @@ def test_an_entry_that_is_left_out_is_found():
     assert len([*kind_faults({"no-such": KINDS["charuco"]})]) == 4
     assert len([*command_faults(["no-such"])]) == 1
     assert len([*finding_faults({"no-such": "calibration/stages/no_such.py"})]) == 1
-    assert len([*effect_faults({"no such": object}, [])]) == 2
+    assert len([*effect_faults({**EFFECTS, "no such": object}, [])]) == 2
+    assert len([*effect_faults({k: v for k, v in EFFECTS.items() if k != "play"}, [])]) == 1
     assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="no-such")])]) == 1
     text = page(".github/CONTRIBUTING.md")
     for there in ("`STAGES`", "`marker.py`", "`_axes`", "`tests/cli/test_cli.py`"):

@@ -331,7 +331,7 @@ def test_a_pose_is_shown_back_and_taken_when_the_person_agrees():
     assert np.abs(state.base_from_flange - wanted).max() < 1e-12
     assert "KUKA" in questions[1]
     assert "x 400.00, y -100.00, z 300.00 mm" in questions[1]
-    raised(DriverError, "at their end", arm.state)
+    raised(DriverError, "No typed pose is left", arm.state)
 
 
 def test_a_person_is_asked_for_each_view_until_it_is_enough():
