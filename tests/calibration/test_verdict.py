@@ -395,7 +395,7 @@ def test_a_view_just_beyond_the_limit_of_outliers_is_no_mistake():
 @pytest.mark.parametrize(
     ("step_mm", "step_deg", "noise_mm", "words"),
     [
-        (1.0, 0.0, 0.03, "their positions to 1 mm: this alone puts the flange off by 0.29 mm an"),
+        (1.0, 0.0, 0.03, "their positions to 1 mm: this alone puts the flange off by 0.29 mm per"),
         slow(1.0, 1.0, 0.03, "their positions to 1 mm and angles to 1 deg:"),
         slow(0.1, 0.0, 0.03, ""),
         # Rounding is the smaller part of it.

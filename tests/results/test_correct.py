@@ -400,7 +400,7 @@ def test_a_payload_is_counted_where_joints_bend(stored, result):
         run("correct", table, "-c", stored, *wrong, "--seed-joints", SEED).refused(words)
 
 
-def test_what_no_stop_has_shown_of_a_payload_counts_in_the_sigma_and_is_said(stored, result):
+def test_the_unseen_effect_of_a_payload_counts_in_the_sigma_and_is_reported(stored, result):
     """Shoulder and elbow were seen to yield; the wrist bore nothing, and yields as wrists do."""
     seen = {"determined": True, "torque_nm": (-300.0, 300.0)}
     hidden = {"determined": False, "torque_nm": (-0.2, 0.2), "sigma_rad_per_nm": 5e-6}
