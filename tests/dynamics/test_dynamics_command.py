@@ -248,12 +248,17 @@ def test_a_recording_without_payload_is_refused(world, run):
         estimate_payload(run.identified, loaded_streams(run.identified, same))
 
 
-SCALES = {"mN m": 1000.0, "the other sign": -1.0, "torques seem 1.4": 1.4}
-
-
-@pytest.mark.parametrize("words", SCALES)
-def test_torques_that_no_payload_makes_are_refused(run, world, words):
-    streams = [item.scaled(SCALES[words]) for item in loaded_streams(run.identified, world.full)]
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (1000.0, "mN m"),
+        (-1.0, "the other sign"),
+        (1.4, "torques seem 1.4"),
+        (0.6, "torques seem 0.6"),
+    ],
+)
+def test_torques_that_no_payload_makes_are_refused(run, world, scale, words):
+    streams = [item.scaled(scale) for item in loaded_streams(run.identified, world.full)]
     raised(DataError, words, estimate_payload, run.identified, streams)
 
 
@@ -351,6 +356,8 @@ def test_the_command_finds_gains(tmp_path):
     visioncal(*again).refused("Name the run without the body first")
     visioncal(*arguments, "--com-mm", "0.08,-0.03,0.08").refused("It is in mm, not in m.")
     visioncal(*arguments, "--com-mm", "80,-30,-80").refused("the body is another one")
+    doubted = visioncal(*arguments, "--mass-kg", "17.6").good()
+    assert "times what its description states" in doubted.err
     visioncal(*arguments, "--mass-kg", "8000").refused("mN m, or mA for A")
     visioncal(*arguments, "--inertia", "0.1,0,0.01,0,0,0.01").refused("are those of no body")
 

@@ -365,8 +365,7 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
     )
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
     gains = drive_gains(base, empty, full, np.asarray(body.values[0]))
-    if not options.unchecked:
-        check_gains(gains, base, empty)
+    doubts = () if options.unchecked else check_gains(gains, base, empty)
     if options.as_json:
         rows: list[dict[str, str | float]] = [{"joint": name} for name in robot.joint_names]
         # Only the joint where its gain is not determined.
@@ -386,6 +385,8 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
         if determined:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
         say(f"{name}: {words}")
+    for words in doubts:
+        say(words, "warning: ", "yellow")
     if gains.determined.all():
         typer.echo(f"--gains {','.join(f'{value:.5g}' for value in gains.nm_per_a)}")
     else:

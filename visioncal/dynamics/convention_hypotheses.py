@@ -32,8 +32,8 @@ _BETTER, _LEFT = 10.0, {True: 0.5, False: 0.1}
 # Torques whose scale to the predicted ones is outside these factors are in other units, such as
 # motor-side torques; only joints of whose torque the links make up at least this share are tested.
 _HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
-# Cosine of the angle, 15 deg, within which estimates by roughly known inertias agree on gravity.
-_ALIGNED = 0.966
+# Cosine of the angle, 5 deg, up to which a mount is that of an axis, and levelled.
+_ALIGNED = 0.9962
 
 
 def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
@@ -52,6 +52,7 @@ def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         if len(measured) >= _LEAST:
             if base.model.robot.inertias is not None:
                 _check_conventions(base, stream.label, measured, known=True)
+                # A tool may multiply a wrist's torques.
                 if _left_with_body(base.model.robot, measured).max() > _LEFT[False]:
                     _check_units(base.model.robot, stream.label, measured)
             # The prediction hardly shows exchanged joints whose torques are mostly friction.
@@ -247,8 +248,8 @@ def _named(joints: tuple[int, ...]) -> str:
     )
 
 
-def _check_units(robot: Robot, label: str, measured: Measured) -> None:
-    """Refuses torques whose scale to the predicted ones shows another unit."""
+def described_scales(robot: Robot, measured: Measured) -> FloatArray:
+    """(n,) torques of the links over those by the robot's inertias; nan where they hardly show."""
     predicted, scales = _predicted(robot, measured.motion), np.full(robot.joint_count, np.nan)
     for joint in range(robot.joint_count):
         factors, left = _joint_fit(measured, predicted, joint)
@@ -256,6 +257,12 @@ def _check_units(robot: Robot, label: str, measured: Measured) -> None:
         share = factors[0] ** 2 * np.var(predicted[:, joint]) / power
         if share > _SHARE and left < _LEFT[True]:
             scales[joint] = factors[0]
+    return scales
+
+
+def _check_units(robot: Robot, label: str, measured: Measured) -> None:
+    """Refuses torques whose scale to the predicted ones shows another unit."""
+    scales = described_scales(robot, measured)
     wrong = np.flatnonzero((scales > _HIGH) | (scales < _LOW))
     if not len(wrong):
         return
