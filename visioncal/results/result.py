@@ -181,7 +181,7 @@ class Calibration(CalibrationSections):
     def next_steps(self) -> tuple[Remedy, ...]:
         """Remedies for the findings, also on tools and fixtures; the most urgent first."""
         doubtful = (name for name, frame in self.frames.items() if frame.verdict.status != "good")
-        frames = (Remedy(f"Read the findings on {name} before it is used.") for name in doubtful)
+        frames = (Remedy(f"Read what was found of {name} before it is used.") for name in doubtful)
         return (*self.verdict.next_steps, *frames)
 
     @typed
