@@ -9,6 +9,7 @@ from support.cells import reporting
 from support.marks import seeds, slow
 from support.wrong_arms import CARRIED, GOOD, SAGGING, WRONG_LINKS, away_m
 
+from visioncal import calibrate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.fit.candidates import effects_of_arms
 from visioncal.fit.inliers import Search
@@ -16,7 +17,9 @@ from visioncal.fit.linearise import predicted
 from visioncal.fit.solve import _explained, effects_of, solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.model import Moments, read_cell
-from visioncal.model.effects import Play, Springs, Weight, Zeros
+from visioncal.model.arm import even_progress
+from visioncal.model.effects import JointsCreep, Play, Springs, Weight, Zeros
+from visioncal.model.effects.lens_grows import TIME_CONSTANTS
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.robot.workspace import postures
 from visioncal.simulation import CellOptions, Payload, cell_session, simulate
@@ -66,7 +69,7 @@ def test_springs_bend_as_the_simulated_arm_does():
         assert found == pytest.approx(true, abs=1e-6)
 
 
-@pytest.mark.parametrize("effect", [Springs, Weight, Play, Zeros])
+@pytest.mark.parametrize("effect", [Springs, Weight, Play, Zeros, JointsCreep])
 def test_slopes_are_those_of_differences(effect):
     robot = bare() if effect is Weight else load_robot("ur10e")
     q, rng = postures(robot)[:5], np.random.default_rng(2)
@@ -136,6 +139,46 @@ def test_play_of_stops_from_both_sides_is_found_within_its_covariance(draws):
         assert fit.used.all()
         squares.append(squares_of(made, fit, "play flange", PLAY))
     assert_honest(squares, 6)
+
+
+def reporting_at(made, moved):
+    """A cell that reports its joints where they were before they moved, (s, n) [rad]."""
+    reported = made.robot.joints - moved
+    return reporting(made, joints=reported, base_from_flange=forward(made.robot.arm, reported))
+
+
+@pytest.mark.parametrize("draws", seeds(2, 8))
+def test_joints_that_creep_are_found_within_their_covariance(draws):
+    """As of an arm that warms up, whose temperatures nobody recorded."""
+    squares = []
+    for seed in draws:
+        made = simulate(replace(GOOD, views=30, seed=seed, mount=MOUNTS[seed % 2]))
+        turns = np.random.default_rng([seed, 31]).normal(0.0, 5e-4, 6)
+        still = JointsCreep("flange", load_robot("ur10e"), TIME_CONSTANTS)
+        left = still.left(Moments({}, {}, even_progress(30), np.arange(30)))
+        made = reporting_at(made, left[:, None] * turns)
+        fit = solve(cell_of(made)).fit
+        assert "joints creep flange" in {effect.name for effect in fit.unknowns.opened}
+        squares.append(squares_of(made, fit, "joints creep flange", turns))
+        verdict = calibrate(cell_session(made, "arm", seen="corners")).verdict
+        assert verdict.causes[0].kind == "joints_creep"
+    assert_honest(squares, 6)
+
+
+@pytest.mark.parametrize("slip_rad", [2e-4, 2e-3])
+def test_a_joint_that_slips_does_not_creep(slip_rad):
+    made = simulate(replace(GOOD, views=30, seed=4))
+    slipped = np.zeros((30, 6))
+    slipped[:14, 2] = slip_rad
+    made = reporting_at(made, slipped)
+    if slip_rad < 1e-3:
+        # Within the noise of single stops, all of which agree.
+        opened = {effect.kind for effect in solve(cell_of(made)).fit.unknowns.opened}
+        assert opened == {"joints step"}
+    else:
+        causes = calibrate(cell_session(made, "arm", seen="corners")).verdict.causes
+        assert causes[0].kind == "joint_slipped"
+        assert "joints_creep" not in {cause.kind for cause in causes}
 
 
 @pytest.mark.parametrize("draws", seeds(1, 8))

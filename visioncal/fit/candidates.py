@@ -31,6 +31,8 @@ from visioncal.model.effects import (
     FocusJitter,
     FrameCreeps,
     Heat,
+    JointsCreep,
+    JointsStep,
     LensChanges,
     LensGrows,
     LensSteps,
@@ -258,7 +260,7 @@ def scored(
         # one that differs from stop to stop does not last.
         lasting = [one[0] for one in found if one[0].typical is one[0]]
         clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
-        if any(isinstance(one, Creeps) for one in clear):
+        if any(isinstance(one, Creeps | JointsCreep) for one in clear):
             creeps = [(one[2], one[0].about_m) for one in found if isinstance(one[0], BaseCreeps)]
             _, place = max(creeps, default=(0.0, ()))
             clear += [one for one in steps(fit, flange, place) if one.name not in known]
@@ -268,7 +270,7 @@ def scored(
         found = [*others, *((one, *best) for one, best in zip(clear, beside, strict=False))]
     for effect, size, gain, explained in found:
         # When something was moved is a free choice.
-        off = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps) else 0.0
+        off = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps | JointsStep) else 0.0
         off += np.log(_ZOOMS) if isinstance(effect, LensSteps) else 0.0
         off += np.log(_SWELLS) if isinstance(effect, BoardSwells) else 0.0
         member = starting_at(random_effect(effect), size)
@@ -324,11 +326,12 @@ def effects_of_arms(fit: Fit) -> Iterator[Effect]:
 def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
     """Effects on what an arm stands on, and on what it carries."""
     stops = np.unique([fit.cell.sightings[at].stop for at in np.flatnonzero(fit.used)])
-    poses = fit.cell.arms[flange].poses
-    stood = stops[np.isfinite(poses[stops, 0, 0])]
+    arm = fit.cell.arms[flange]
+    stood = stops[np.isfinite(arm.poses[stops, 0, 0])]
     if len(stood) >= processes.ENOUGH_STOPS:
         is_swept = any(sweep.flange == flange for sweep in fit.cell.sweeps)
-        stood_there = Stood(poses, stood, is_swept, _beside(fit, flange))
+        robot = arm.model if arm.has_joints else None
+        stood_there = Stood(arm.poses, stood, is_swept, _beside(fit, flange), robot)
         for kind in NAMED:
             yield from kind.of_flange(flange, stood_there)
 
@@ -365,11 +368,13 @@ def creeps_of_frames(fit: Fit) -> Iterator[Effect]:
 
 
 def steps(fit: Fit, flange: str, place: tuple[float, ...]) -> Iterator[Effect]:
-    """Effects of frames that were moved at once: rivals to those that creep, about a place [m]."""
-    progress = fit.cell.moments.progress
+    """Effects of what was moved at once: rivals to those that creep, about a place [m]."""
+    progress, arm = fit.cell.moments.progress, fit.cell.arms[flange]
     for at in (evenly(len(progress) - 3, _STEPS) + 1).tolist():
         yield BaseSteps(flange, place, float(progress[at]))
         yield MountSteps(flange, float(progress[at]))
+        if arm.has_joints and arm.model is not None:
+            yield JointsStep(flange, arm.model, float(progress[at]))
 
 
 def beside_zooms(fit: Fit, changes: Iterable[Candidate]) -> Iterator[Candidate]:

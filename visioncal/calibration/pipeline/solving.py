@@ -129,7 +129,7 @@ def _fit(
     misread = observed.misread
     inliers = all_as_inliers(start.problem, start.state) if misread else initial_inliers(start)
     others = (*clock_effects(cell, observed.clocks), *creep_effects(inliers.problem))
-    known = ErrorSizes(opened=measured.stepped)
+    known = ErrorSizes(opened=measured.opened)
     initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, others, sizes=known)
     if misread:
         # Misread poses determine neither lens, board and arm nor which views are outliers.

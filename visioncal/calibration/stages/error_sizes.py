@@ -13,6 +13,7 @@ from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
 from visioncal.fit.held import doubted_boards
 from visioncal.fit.linearise import MEASURED_NOISES, sight_weights
+from visioncal.fit.sizes import most_likely
 from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
@@ -24,7 +25,6 @@ from visioncal.model.effects import (
     LensGrows,
     LensSteps,
     Named,
-    SightSteps,
 )
 from visioncal.model.effects.effect import LensEffect
 from visioncal.session import frame_name
@@ -41,6 +41,15 @@ class FoundEffect:
     columns: FloatArray  # See `Effect.columns`, at the session's stations.
     values: FloatArray  # (c,) estimates.
     covariance: FloatArray  # (c, c) of these.
+    gain: float  # Twice the gain in log-likelihood.
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedEffect:
+    """An effect on a flange of a size that chance does not explain."""
+
+    effect: Effect
+    size: float  # Standard deviation of its values.
     gain: float  # Twice the gain in log-likelihood.
 
 
@@ -76,7 +85,7 @@ class ErrorSizes:
     # Other lenses that changed, by camera: the fit has them as lenses that vary from view to view,
     # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
-    opened: tuple[Effect, ...] = ()  # Of frames that move; of measured poses, their steps alone.
+    opened: tuple[OpenedEffect, ...] = ()  # Those that findings name.
     displaced: tuple[Displaced, ...] = ()  # By panes before lenses, and boards that swell.
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
     # Shares by which boards are larger than stated, by frame: where their fit starts.
@@ -164,9 +173,8 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         # A step beside a larger growth is what its course differs by.
         if abs(zoom.share) > grew.get(name, 0.0):
             zoomed[name], grew[name] = zoom, abs(zoom.share)
-    effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
     displaced = tuple(_displaced(fit))
-    known = tuple(effects), displaced, fit.unknowns.rivals, scales_of(solved)
+    known = _opened(fit), displaced, fit.unknowns.rivals, scales_of(solved)
     return ErrorSizes(levels, lenses, boards, grown, zoomed, *known)
 
 
@@ -184,7 +192,7 @@ class MeasuredErrors:
     # flange from stop to stop.
     noise: Mapping[int, FloatArray] = field(default_factory=dict)
     sizes: Mapping[str, float] = field(default_factory=dict)  # Sigmas of scales, by frame.
-    stepped: tuple[Effect, ...] = ()  # Cameras whose distances changed at once.
+    opened: tuple[OpenedEffect, ...] = ()  # See `ErrorSizes`.
 
 
 def measured_errors(solved: CellFit | None) -> MeasuredErrors:
@@ -214,8 +222,20 @@ def measured_errors(solved: CellFit | None) -> MeasuredErrors:
         middle = np.zeros(3) if board is None else corner_positions(board).mean(axis=0)
         factor = np.linalg.inv(sight_weights(pose.matrix[None], middle)[0]) * sigmas
         noise[one.view] = factor @ factor.T + of_flange
-    stepped = (at for at in fit.unknowns.opened if isinstance(at, SightSteps))
-    return MeasuredErrors(noise, sizes, tuple(stepped))
+    return MeasuredErrors(noise, sizes, _opened(fit))
+
+
+def _opened(fit: Fit) -> tuple[OpenedEffect, ...]:
+    """Effects on flanges that findings name."""
+    found = list[OpenedEffect]()
+    for at in fit.unknowns.opened:
+        if isinstance(at, Named) and at.frame in fit.cell.arms and fit.sizes[at.name] <= at.most:
+            # Without it, the flange's noise is another.
+            low, high = fit.unknowns.closing({*fit.unknowns.closed, at.name}).bounds()
+            without = most_likely(fit.mixed, np.clip(fit.estimate.logs, low, high), low, high)
+            gain = without.estimate.value - fit.estimate.value
+            found.append(OpenedEffect(at, fit.sizes[at.name], gain))
+    return tuple(found)
 
 
 def solve_session(observed: Observed) -> CellFit:

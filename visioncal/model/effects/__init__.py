@@ -22,6 +22,8 @@ from visioncal.model.effects.effect import Size as Size
 from visioncal.model.effects.effect import Stood as Stood
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
 from visioncal.model.effects.heat import Heat as Heat
+from visioncal.model.effects.joints_creep import JointsCreep as JointsCreep
+from visioncal.model.effects.joints_creep import JointsStep as JointsStep
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
 from visioncal.model.effects.lens_sags import LensSags as LensSags
 from visioncal.model.effects.lens_steps import LensChanges as LensChanges
@@ -55,6 +57,7 @@ NAMED: tuple[type[Named], ...] = (
     BaseCreeps,
     MountCreeps,
     ArmGrows,
+    JointsCreep,
     BracketBends,
     LensGrows,
     LensSags,

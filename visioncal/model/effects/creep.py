@@ -17,7 +17,7 @@ from visioncal.model.effects.effect import Effect, Named, Stood
 from visioncal.model.effects.lens_grows import TIME_CONSTANTS
 
 # By which motion fades over the session: evenly, as what warms up, as what settles in some stops.
-_RATES = (0.0, TIME_CONSTANTS, 20.0)
+RATES = (0.0, TIME_CONSTANTS, 20.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Creeps(_Moves, Named):
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
         """Even creep, creep as of warming, and creep that settles in the first stops."""
         del stood
-        yield from (cls(flange, rate=rate) for rate in _RATES)
+        yield from (cls(flange, rate=rate) for rate in RATES)
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
@@ -96,7 +96,6 @@ class BaseCreeps(Creeps, _OfBase):
 
     kind, what = "base creeps", "The base, or what stands in it,"
     clause = "the base, or what stands in it, crept"
-    is_imitated = False
     do = (
         "Fasten the base, the fixed camera and the fixed target, let the cell warm up, and record "
         "again."
@@ -106,7 +105,7 @@ class BaseCreeps(Creeps, _OfBase):
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
         """Creeps about the base, and about what stands in it, of all rates."""
         for place in dict.fromkeys([(), stood.beside_m]):
-            yield from (cls(flange, place, rate) for rate in _RATES)
+            yield from (cls(flange, place, rate) for rate in RATES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,6 @@ class ArmGrows(Creeps):
 
     kind, what, bounds, count = "arm grows", "The arm", (1e-3, 1e-7, 0.02), 1
     clause = "the arm warmed up or cooled"
-    is_imitated = False
     most = 1e-3  # Aluminium grows by so much in 43 K, and steel in 90.
     do = "Let the arm warm up at its work for half an hour, and record again."
 

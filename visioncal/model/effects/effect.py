@@ -9,6 +9,7 @@ import numpy as np
 
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.model.arm import Moments
+from visioncal.robot import Robot
 from visioncal.vision.camera import intrinsics
 
 Place: TypeAlias = Literal["edge", "lens", "corners"]
@@ -104,6 +105,7 @@ class Stood:
     seen: IntArray  # (k,) stops at which something was seen.
     is_swept: bool  # Whether it moved meanwhile.
     beside_m: tuple[float, ...] = ()  # Where its base has what stands in it; empty of nothing [m].
+    robot: Robot | None = None  # The arm's model, where its joint angles are known.
 
 
 class Named(ABC):
@@ -114,9 +116,6 @@ class Named(ABC):
     most: ClassVar[float]
     do: ClassVar[str]  # Advice.
     hides: ClassVar[tuple[str, ...]] = ()  # Kinds of findings that are mere effects of it.
-    # Whether errors of the arm that last look like it: only the one likelihood, which has these,
-    # can say that it acts.
-    is_imitated: ClassVar[bool] = True
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:

@@ -24,7 +24,6 @@ class LensGrows(LensEffect, Named):
 
     kind, bounds, count, most = "lens grows", (1e-2, 1e-7, 0.1), 3, 3e-3
     clause = "the lens crept"
-    is_imitated = False
     do = "Let the camera run for half an hour before it is calibrated and used."
     rate: float = TIME_CONSTANTS  # By which it fades, over the session; zero of an even one.
 

@@ -21,7 +21,6 @@ class LensSags(LensEffect, Named):
 
     kind, bounds, count, most = "lens sags", (1e-2, 1e-7, 0.1), 9, 1e-2
     clause = "the lens gives way with its weight"
-    is_imitated = False
     do = "Lock the lens in its mount, and its focus ring, or record and work in the same attitudes."
     flange: str
 

@@ -206,7 +206,7 @@ class BracketBends(PostureEffect, Named):
 
     kind, bounds, count, most = "bracket bends", (1e-2, 1e-7, 0.1), 18, 3e-3
     clause = "what the flange carries bends with its weight"
-    is_imitated, moves_flange = False, True
+    moves_flange = True
     do = "Stiffen the bracket, or record and work in the same attitudes."
 
     @classmethod

@@ -25,7 +25,7 @@ class _AlongMotion(Effect, Named):
     the cell's stops the poses are right.
     """
 
-    count, bounds, most, is_imitated = 6, (1e-2, 1e-6, 0.1), 5e-2, False
+    count, bounds, most = 6, (1e-2, 1e-6, 0.1), 5e-2
     # After the largest motions it is no multiple of these.
     hides = ("wrong_views",)
     poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
