@@ -162,6 +162,7 @@ def test_joints_that_creep_are_found_within_their_covariance(draws):
         squares.append(squares_of(made, fit, "joints creep flange", turns))
         verdict = calibrate(cell_session(made, "arm", seen="corners")).verdict
         assert verdict.causes[0].kind == "joints_creep"
+        assert "joint_slipped" not in {finding.kind for finding in verdict.findings}
     assert_honest(squares, 6)
 
 

@@ -29,7 +29,7 @@ from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import FRAME, with_step
 from visioncal.estimation.unknowns import BOARD, LENS, SIZE
-from visioncal.model.effects import Creeps
+from visioncal.model.effects import Creeps, JointsCreep
 from visioncal.robot.model import REPEATABILITY
 from visioncal.vision.camera import intrinsics
 
@@ -37,7 +37,7 @@ _LIMITS = CalibrationLimits()
 # Scatter that arms have anyway [mm, deg].
 _USUAL = _LIMITS.repeatability * np.array(REPEATABILITY)
 _OF_LENSES = ("focus", "image_shifted")
-_CREEPS = [name for name, kind in KINDS.items() if issubclass(kind, Creeps)]
+_CREEPS = [name for name, kind in KINDS.items() if issubclass(kind, Creeps | JointsCreep)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     """
     by_arms, rest, found = list[Finding](), 1.0, [*found]
     by_lens = max((at.mahalanobis_sq for at in found if at.kind in _OF_LENSES), default=0.0)
-    is_stepped = False
+    is_stepped, is_creeping = False, any(finding.kind in _CREEPS for finding in found)
     for finding in found:
         if finding.kind == ARM_ERRORS:
             by_arms.append(finding)
@@ -81,6 +81,9 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
+        if is_creeping and finding.kind in STEPS and share < 0.5:
+            # Creep of another course than the fitted one leaves a small step.
+            continue
         is_apart = bool(trial.is_in_fit and CLEAR_RATIO**2 * left[1] < left[0])
         if is_apart:
             rest = min(rest, 1.0 - share)
