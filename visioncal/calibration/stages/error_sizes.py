@@ -234,7 +234,8 @@ def _opened(fit: Fit) -> tuple[OpenedEffect, ...]:
             low, high = fit.unknowns.closing({*fit.unknowns.closed, at.name}).bounds()
             without = most_likely(fit.mixed, np.clip(fit.estimate.logs, low, high), low, high)
             gain = without.estimate.value - fit.estimate.value
-            found.append(OpenedEffect(at, fit.sizes[at.name], gain))
+            if gain > at.size.limit:
+                found.append(OpenedEffect(at, fit.sizes[at.name], gain))
     return tuple(found)
 
 
