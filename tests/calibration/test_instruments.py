@@ -9,6 +9,7 @@ import pytest
 from support.commands import visioncal as command
 from support.refusals import raised
 from support.tracked import errors_of, known_of
+from support.wrong_arms import CARRIED, COBOT
 
 import visioncal
 from visioncal.calibration.pipeline.run_state import RunState
@@ -54,6 +55,20 @@ def test_errors_follow_their_covariance(options):
     # In one case of a thousand chi-square is beyond either.
     low, high = chi2_limit(np.array([0.9995, 0.0005]), 3 * len(kept))
     assert low < squares < high
+
+
+@pytest.mark.parametrize("stated", [[0, 0, 9.81], [-9.81, 0, 0]])
+def test_an_arm_whose_mounting_is_not_as_stated_is_named_with_its_gravity(stated):
+    bends = {"payloads": CARRIED, "compliance_rad_per_nm": tuple(1.0 / np.array(COBOT))}
+    shop = tracked(replace(POINT, stops=40, **bends))
+    known = known_of(session_of(shop, robot={"model": "ur10e", "gravity_m_s2": stated}))
+    first = known.verdict.causes[0]
+    assert first.kind == "mounting"
+    assert first.probability > 0.99
+    assert "Write gravity_m_s2 = [0, 0, -9.81] under [robot]" in first.do.words
+    assert not any("run out" in finding.words for finding in known.verdict.findings)
+    right = known_of(session_of(shop, robot={"model": "ur10e", "gravity_m_s2": [0, 0, -9.81]}))
+    assert right.verdict.status == "good"
 
 
 @pytest.mark.slow

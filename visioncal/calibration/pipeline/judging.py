@@ -91,6 +91,8 @@ def _use(run: RunState) -> Remedy:
     elif run.mount == "instrument" or not run.session.boards:
         words, command = "Take the transform to another program", "export OUT --to text"
     again = "visioncal verify compares later stops with it."
+    if run.mount == "instrument":
+        again = "visioncal diff compares a later one with it."
     return Remedy(f"{words}, and keep the result: {again}", f"visioncal {command}")
 
 

@@ -8,6 +8,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.kinematics import findings
+from visioncal.calibration.suspects.mounting import other_mounting
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, REMARK, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg
@@ -28,9 +29,13 @@ def _found(run: RunState) -> Iterator[Finding]:
     for name, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         levels = () if arm.kinematics is None else (*findings(arm.kinematics),)
-        notes = remarks((*drifts, *levels, *reports[name].notes), NOTE)
+        mounting = other_mounting(run, arm)
+        # Encoders, zeros and springs are those of the wrong one.
+        found = () if mounting is not None else reports[name].notes
+        notes = remarks((*drifts, *levels, *found), NOTE)
         stops = len(stops_of(run.assessment.fit.problem, name))
-        for finding in (*_of(arm, run.cell_fit.level, stops), *reports[name].doubts, *notes):
+        own = (*([mounting] if mounting else []), *_of(arm, run.cell_fit.level, stops))
+        for finding in (*own, *reports[name].doubts, *notes):
             yield finding.of("" if len(arms) == 1 else f"Robot {name}")
 
 

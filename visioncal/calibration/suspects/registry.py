@@ -15,6 +15,7 @@ from visioncal.calibration.suspects import (
     lens,
     mirrored_cell,
     misread_poses,
+    mounting,
     rounded_poses,
     steps,
     turned_views,
@@ -79,6 +80,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     # Arms, steps, lenses and boards.
     arm.ERRORS,
     arm.HEAT,
+    mounting.MOUNTING,
     steps.MOVED_AT_ONCE,
     steps.JOINT_SLIPPED,
     steps.BOARD_CHANGED,

@@ -1,0 +1,89 @@
+"""An arm that hangs or is on a wall, where its mounting is not stated: loads bend it otherwise."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.arm_results import change_each
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.cell import robot_key
+from visioncal.calibration.stages.kinematics import SelectedArmLevel
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
+from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
+from visioncal.robot import Robot
+
+# Kind of the finding, and size of gravity [m/s^2].
+KIND, _G_M_S2 = "mounting", 9.81
+# Twice the gain in log-likelihood that chance leaves to one of five directions in a million.
+_CLEAR = 30.0
+
+
+def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
+    """The finding that another direction of gravity explains what bends an arm, if one does."""
+    own, fit = arm.kinematics, run.cell_fit.fit
+    documents = {robot_key(name): at for name, at in run.session.robot_documents.items()}
+    if own is None or arm.matched is None or arm.robot not in documents:
+        return None
+    known, declared = arm.matched.robot, Robot.from_document(documents[arm.robot])
+    noise_rad, noise_m = fit.noise.robots[fit.robots.index(arm.robot)].tolist()
+    repeats_mm, repeats_deg = known.repeatability
+    # Such an arm leaves as much anyway.
+    is_usual = 1e3 * noise_m < repeats_mm and np.rad2deg(noise_rad) < repeats_deg
+    if is_usual or not (known.masses is not None or arm.loads.any):
+        return None
+    home = np.zeros((1, known.joint_count))
+    moved = (known.base_from_flange(home) @ invert(declared.base_from_flange(home)))[0]
+    tried = list[tuple[SelectedArmLevel, FloatArray]]()
+    for axis in _G_M_S2 * np.concatenate([np.eye(3), -np.eye(3)]):
+        is_stated = axis @ declared.gravity > 0.9 * _G_M_S2**2
+        level = None if is_stated else _level(run, arm, moved[:3, :3] @ axis)
+        if level is not None:
+            tried.append((level, axis))
+    if not tried:
+        return None
+    level, axis = max(tried, key=lambda pair: pair[0].fit.gain)
+    gain = level.fit.gain - own.fit.gain
+    before_mm, after_mm = (at.fit.result.held_out_mm for at in (own, level))
+    if gain < _CLEAR or CLEAR_RATIO * after_mm > before_mm:
+        return None
+    line = f"gravity_m_s2 = [{', '.join(f'{value:g}' for value in axis + 0.0)}]"
+    was = "stated" if "gravity_m_s2" in declared.document else "assumed, since none is stated"
+    return Finding(
+        KIND,
+        f"Gravity acts along another direction of the robot's base than is {was}, as on an arm "
+        f"that hangs or is on a wall: with {line}, stops left out are predicted to "
+        f"{figure(after_mm)} mm, else to {figure(before_mm)} mm.",
+        Remedy(f"Write {line} under [robot] of session.toml, and calibrate again.", CALIBRATE),
+        mahalanobis_sq=gain,
+        is_proven=True,
+    )
+
+
+def _level(run: RunState, arm: RobotArm, gravity: FloatArray) -> SelectedArmLevel | None:
+    """The errors of an arm with (3,) gravity in the base of its poses [m/s^2]."""
+    cell_fit, used = run.cell_fit, np.flatnonzero(run.cell_fit.inlier_fit.used)
+    views = [cell_fit.cell.rows[at].view for at in used]
+
+    def with_gravity(other: RobotArm, nominal: Problem, start: State) -> RobotArm:
+        matched = other.matched
+        if other.robot != arm.robot or matched is None:
+            return other
+        robot = matched.robot
+        document = {**robot.document, "gravity_m_s2": gravity.tolist()}
+        robot = replace(robot, document=document, gravity=gravity)
+        other = replace(other, matched=replace(matched, robot=robot), model=None)
+        return other.with_level(nominal, start, cell_fit.level, views, cell_fit.noise)
+
+    return change_each(cell_fit.arms, cell_fit.fit, with_gravity)[arm.robot].kinematics
+
+
+# Its misfit goes into encoders, links and scatter, and puts some views far off.
+_EFFECTS = (ARM_ERRORS, UNEXPLAINED, "arm_parameter", "load", "wrong_views")
+MOUNTING = Suspect(KIND, None, 1e-6, True, _EFFECTS, INFLATED)
