@@ -15,7 +15,7 @@ from support.marks import crossed, slow
 from support.misfits import misfit
 from support.pages import Page
 from support.refusals import raised
-from support.wrong_arms import target_in_camera
+from support.wrong_arms import COBOT, target_in_camera
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.run import calibrate
@@ -26,6 +26,7 @@ from visioncal.results import Calibration
 from visioncal.results.history import History
 from visioncal.robot import load_robot
 from visioncal.session import Session
+from visioncal.session.table import loads_of
 from visioncal.simulation import (
     CellOptions,
     Second,
@@ -34,6 +35,9 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
+from visioncal.simulation.arms import Payload
+from visioncal.simulation.instrument_session import InstrumentOptions, tracked
+from visioncal.simulation.instrument_session import session_of as tracked_session
 from visioncal.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.check import check
@@ -266,6 +270,30 @@ def test_a_change_is_reported_with_its_size(place, name):
         assert found.named[0].explained.values[-1] == pytest.approx(-0.01, abs=5e-4)
         anew = checked(place, np.random.default_rng(1), change, board_placed_anew=True)
         assert names(anew) == ["board_size"]
+
+
+def test_a_stated_load_that_the_calibration_has_not_seen_is_what_bends_the_arm(place):
+    cell, robot = again(place.cell, np.random.default_rng(4)), load_robot("ur10e")
+    q, load = cell.robot.joints, Payload(6.0, (0.0, 0.0, 0.1))
+    moments = robot.load_torques(q, loads_of([load.row()] * len(q))) - robot.load_torques(q)
+    carrying = reporting(cell, joints=q - moments / COBOT, loads=(load,) * len(q))
+    found = checked_of(known_of(carrying), place.calibration)
+    assert names(found) == ["load"]
+    assert "payload_kg up to 6, and 0 kg when it was calibrated" in verdict_of(found).reasons[0]
+    # One that bends nothing is no change.
+    same = reporting(cell, loads=(load,) * len(q))
+    assert checked_of(known_of(same), place.calibration).passed
+
+
+def test_angles_in_degrees_are_no_scatter_of_the_robot(place):
+    cell = again(place.cell, np.random.default_rng(4))
+    known = known_of(reporting(cell, joints=np.rad2deg(cell.robot.joints)))
+    raised(DataError, "With the angles in degrees", checked_of, known, place.calibration)
+
+
+def test_readings_of_an_instrument_are_compared_by_calibrating_them():
+    session = tracked_session(tracked(InstrumentOptions(stops=12)))
+    raised(DataError, "visioncal diff", verify, session, calibrate(session))
 
 
 def test_a_board_that_was_placed_anew_is_no_fault(place):

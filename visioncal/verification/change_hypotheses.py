@@ -16,7 +16,7 @@ from visioncal.verification.prediction import PredictedStops, board_changes
 from visioncal.vision.corners import CornerStack
 from visioncal.vision.poses import fit_poses
 
-CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW, PAIRING = (
+CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LOAD, LENGTH, NOISE, VIEW, PAIRING = (
     "camera",
     "lens",
     "board",
@@ -24,6 +24,7 @@ CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW, PAIRING =
     "board_size",
     "board_replaced",
     "joint",
+    "load",
     "arm_length",
     "robot_noise",
     "view",
@@ -38,6 +39,8 @@ _SMALL_SHARE, _LARGE_SHARE = 1e-3, 0.5
 # Displacement from which on a board is not in place, as by a millimetre and 4 mrad for each of
 # these [m]; and unit of a change that is one or none.
 _FAR_M, _WHOLE = 5e-3, 10.0
+# Joints that a load reaches by a smaller share of its greatest torque do not bend.
+_LEAST_SHARE = 0.01
 # Units of a twist, for a change of one metre.
 MOTION_UNITS: FloatArray = np.repeat([TURN_PER_M, 1.0], 3)
 
@@ -147,12 +150,33 @@ def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Chan
         by_flange = offsets[:, :, joint : joint + 1]
         name = f"{JOINT} {joint + 1}"
         yield ChangeHypothesis(name, unit, flange_jacobian=by_flange, at=joint)
+    yield from _load(predicted, prior, model, offsets)
     # All lengths by a share: a placement's offset is in the frame before it, its twist after it.
     placements = arm.chain.placements
     twists = np.zeros((len(placements), 6))
     twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
     stretch = arm.placement_jacobian(q) @ twists.reshape(-1, 1)
     yield ChangeHypothesis(LENGTH, np.ones(1), flange_jacobian=stretch)
+
+
+def _load(
+    predicted: PredictedStops, prior: CalibrationPrior, model: ArmModel, offsets: FloatArray
+) -> Iterator[ChangeHypothesis]:
+    """Bending of each joint by stated loads that a calibration without stiffness has not seen."""
+    observed, calibrated = predicted.observed, prior.calibration
+    arm = observed.arm_at(observed.first_of_stops(observed.used))
+    more_kg = arm.loads.payload_kg - calibrated.means.get("payload_kg", 0.0)
+    loads = replace(arm.loads, payload_kg=more_kg)
+    if calibrated.elastic is not None or arm.joints_rad is None or not loads.any:
+        return
+    robot, q = model.robot, arm.joints_rad
+    torques = robot.load_torques(q, loads) - robot.load_torques(q)
+    greatest = np.abs(torques).max(axis=0)
+    bent = greatest > _LEAST_SHARE * greatest.max()
+    # Joints of about equal stiffness.
+    by_flange = (offsets * (torques / greatest.max())[:, None, :])[:, :, bent]
+    units = np.full(int(bent.sum()), TURN_PER_M)
+    yield ChangeHypothesis(LOAD, units, flange_jacobian=by_flange)
 
 
 def _views(

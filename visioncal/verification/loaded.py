@@ -28,8 +28,8 @@ from visioncal.session.table import loads_of
 from visioncal.verification.calibration_prior import CalibrationPrior
 
 _MISFIT = Remedy(
-    "Read some unloaded stops again: instrument, probe or base may have moved since.",
-    "visioncal verify SESSION --against OUT",
+    "Read unloaded stops again: instrument, probe or base may have moved since. Calibrate them, "
+    "and compare both results with visioncal diff."
 )
 _WEIGH = Remedy("Weigh the loads, and correct payload_kg and its centre in views.csv.")
 # Prior of a compliance of which nothing is known: a gear of 10 kN m/rad [rad/(N m)].

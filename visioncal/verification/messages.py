@@ -29,6 +29,7 @@ from visioncal.verification.change_hypotheses import (
     JOINT,
     LENGTH,
     LENS,
+    LOAD,
     NOISE,
     PAIRING,
     REPLACED,
@@ -86,11 +87,19 @@ _KINDS = {
     SIZE: (_SIZE_WORDS, _ANOTHER_BOARD),
     REPLACED: (_SIZE_WORDS + "; its middle {moved}", _ANOTHER_BOARD),
     JOINT: (
-        "{joint} off by {offset} from what it reads: its encoder slipped, or its zero was lost",
+        "{joint} off by {offset} from what it reads: its encoder slipped, its zero was lost, or "
+        "a load bends it that was not there",
         Remedy(
             "Look whether the joint keeps its zero (a coupling that slips does so again), then "
             f"{_ANEW}",
             CALIBRATE_ANEW,
+        ),
+    ),
+    LOAD: (
+        "the load bends the arm, and the calibration has not seen it: {load}",
+        Remedy(
+            "Verify without it; or calibrate by stops with and without it (payload_kg in all rows, "
+            "0 without), which finds how far the joints bend."
         ),
     ),
     LENGTH: (
@@ -206,6 +215,7 @@ def change_words(check: Check, change: PossibleChange) -> str:
         "steel": abs(share) / _STEEL,
         "factor": found.get("noise_factor", 1.0),
         "pairs": _pair_words(change.cause.pairs),
+        "load": _load_words(check),
     }
     if change.cause.kind == JOINT:
         unit = "mm" if "offset_mm" in found else "deg"
@@ -216,6 +226,16 @@ def change_words(check: Check, change: PossibleChange) -> str:
             "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
         }
     return _KINDS[change.cause.kind][0].format(**facts)
+
+
+def _load_words(check: Check) -> str:
+    """The loads that the rows state, and the calibration's."""
+    rows = [view.numbers for view in check.predicted.observed.session.views]
+    kg = [row.get("payload_kg", 0.0) for row in rows]
+    was = check.calibration.means.get("payload_kg", 0.0)
+    has_force = any(row.get(f"force_{axis}_n") for row in rows for axis in "xyz")
+    force = " and forces" if has_force else ""
+    return f"payload_kg up to {max(kg):g}{force}, and {was:g} kg when it was calibrated"
 
 
 def _is_carried(check: Check, is_camera: bool) -> bool:
@@ -260,6 +280,8 @@ def _estimates(check: Check, change: PossibleChange) -> dict[str, Any]:
     kind, explained = change.cause.kind, change.explained
     if kind == NOISE:
         return {"noise_factor": explained.noise_factor}
+    if kind == LOAD:
+        return {}
     if kind == PAIRING:
         return {"pairs": change.cause.pairs}
     if kind == BOTH:

@@ -30,6 +30,8 @@ from visioncal.vision.targets import numbered_positions, target_document
 
 # Models whose flanges move alike to this [m and rad] are of the same robot: tables have six digits.
 _ONE_ROBOT = 1e-5
+# Next step for readings of an instrument, which are not verified stop by stop.
+COMPARED = "Calibrate the new session, and compare both results with visioncal diff."
 _STAGES = {stage.name: stage.run for stage in STAGES}
 
 
@@ -79,6 +81,12 @@ def predict_stops(
             the calibrated arm needs, or shows no target.
     """
     check_mount(session, prior.calibration)
+    if session.mount == "instrument":
+        raise DataError(
+            f"session {session.name!r} has an instrument's readings, and changes are looked for in "
+            "what a camera sees.",
+            next_step=COMPARED,
+        )
     session, calibrated = _with_calibrated_targets(session, prior), prior.calibration.robot
     if calibrated is not None:
         if session.robot_document is not None:
@@ -115,6 +123,8 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     # Of a sweep the slower views are used, where the error of the clock offset is below the
     # robot's.
     run = replace(_STAGES["clock"](_STAGES["pnp"](run)), clocks={})
+    # A joint's zero may be what changed; another reading of the angles is a mistake of the record.
+    _STAGES["joints"](replace(run, level="hand-eye"))
     observed = _with_poses(_with_arm(ObservedPoses.of(run), prior), prior)
     problem, warnings = observed.problem(observed.used), tuple(_warnings(observed, prior))
     return PredictedStops(observed, problem, observed.used, warnings)
