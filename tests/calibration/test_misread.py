@@ -490,6 +490,10 @@ SLIPS = {
         "q3_rad and q5_rad exchanged",
     ),
     "a joint's sign": ({"joints": Q * [1, 1, -1, 1, 1, 1]}, "q3_rad of the opposite sign"),
+    "a joint's angle with another's in it": (
+        {"joints": Q + np.outer(Q[:, 1], np.eye(6)[2])},
+        "q3_rad less q2_rad for the third joint",
+    ),
     "two joints from another zero": (
         {"joints": Q - np.pi / 2 * np.array([0, 1, 0, -1, 0, 0])},
         "+90 deg added to q2_rad and -90 deg added to q4_rad",
@@ -576,6 +580,15 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     words = "needs the joint angles"
     error = raised(DataError, words, visioncal.calibrate, session, level="kinematics")
     assert "multiply q1_rad to q6_rad by pi / 180" in error.next_step
+
+
+def test_a_zero_that_is_a_quarter_turn_off_is_no_other_mistake_of_the_poses():
+    joints = Q - [0, np.pi / 2, 0, 0, 0, 0]
+    first, *others = visioncal.calibrate(session_with(joints, with_poses=False)).verdict.causes
+    # Errors of the links are in it, too.
+    words = "zero of shoulder_lift_joint (q2_rad) moved by "
+    assert f"{words}89" in first.words or f"{words}90" in first.words
+    assert not any("not those of the images" in cause.words for cause in others)
 
 
 @pytest.mark.slow

@@ -377,6 +377,7 @@ CSV_REFUSALS = [
     ("0.6,0,0.3", "0.6,0,0,3", "line 3: it has 14 fields"),
     (",note", ",role", r"column role is there twice \(columns 3 and 13\)"),
     (",qw,", ",w,", "the columns x_m, .* lack qw"),
+    (",z_m,", ",z_mm,", "lack z_m; write z_mm as z_m, in the unit of that name"),
     ("3,,holdout", "3.5,,holdout", r"line 3, column view: '3\.5' must be a whole number"),
     ("3,,holdout", "7,,holdout", r"line 3, column view: 7 is already the view of .*line 2"),
     ("holdout", "test", 'line 3, column role: \'test\' must be a role: "fit", "holdout"'),

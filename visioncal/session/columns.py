@@ -1,7 +1,7 @@
 """Columns of views.csv: known ones, and groups of them."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 
 from scipy.spatial.transform import Rotation
@@ -136,6 +136,14 @@ def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
     return tuple(lower[word] for word in group)
 
 
+def of_other_units(missing: Sequence[str], columns: Iterable[str]) -> str:
+    """Words on columns of the same quantities as missing ones, in other units; empty for none."""
+    stems = {name.rpartition("_")[0]: name for name in missing}
+    pairs = ((name, stems.get(name.rpartition("_")[0])) for name in columns)
+    turned = [f"{name} as {wanted}" for name, wanted in pairs if wanted and name != wanted]
+    return f"; write {', '.join(turned)}, in the unit of that name" if turned else ""
+
+
 def _header_problems(columns: Sequence[str]) -> Iterator[str]:
     for place, name in enumerate(columns, start=1):
         if not name:
@@ -149,13 +157,14 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
     wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
     gaps = [name for name in wanted if name not in joints]
     if gaps:
-        yield f"the joint columns {', '.join(joints)} lack {', '.join(gaps)}"
+        beside = of_other_units(gaps, columns)
+        yield f"the joint columns {', '.join(joints)} lack {', '.join(gaps)}{beside}"
     for group in WHOLE_GROUPS:
         missing = [name for name in group if name not in columns]
         if 0 < len(missing) < len(group):
             yield (
                 f"the columns {', '.join(name for name in group if name in columns)} "
-                f"lack {', '.join(missing)}"
+                f"lack {', '.join(missing)}{of_other_units(missing, columns)}"
             )
 
 

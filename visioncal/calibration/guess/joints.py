@@ -91,6 +91,7 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
     for at, name in enumerate(robot.joint_names):
         fix = f"Negate q{at + 1}_rad, or turn the axis of {name} in the robot's model."
         yield entry(f"q{at + 1}_rad of the opposite sign", fix, np.diag(1.0 - 2.0 * same[at]), at)
+    yield from _coupled(robot)
     # Zeros of DH tables and of makers differ by quarter turns; those of the first joint and the
     # last hide in the constants, and a single one is sought with all zeros.
     inner = (np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist()
@@ -118,6 +119,17 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
             fix = f'In session.toml, write model = "{model.name}" for this robot.'
             words = f"the arm a {model.name} and not a {robot.name}"
             yield replace(entry(words, fix, same), robot=model)
+
+
+def _coupled(robot: Robot) -> Iterator[JointReading]:
+    """The third joint's angle with the second's in it: FANUC's count it from the horizon."""
+    same = declared_reading(robot)
+    for sign, word in ((-1.0, "less"), (1.0, "plus")) if robot.joint_count > 3 else ():
+        mixing = same.mixing.copy()
+        mixing[2, 1] = sign
+        words = f"q3_rad {word} q2_rad for the third joint (coupled, as FANUC counts it)"
+        fix = f"In all rows, write q3_rad {word} q2_rad into q3_rad."
+        yield replace(same, mixing=mixing, words=words, fix=fix, columns=(2,), cost=1.0)
 
 
 @cache

@@ -17,6 +17,7 @@ from visioncal.robot import Robot
 from visioncal.robot.conversion import with_base
 from visioncal.robot.files import robot_names
 from visioncal.session import View
+from visioncal.session.columns import of_other_units
 from visioncal.session.table import reported_matrices
 
 # Differences of poses and model [m, rad]: controllers print poses to 0.01 mm or 1e-5 rad at worst;
@@ -67,7 +68,9 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
     by_view = reported_matrices([row for row in rows if row.number in joints])
     if counts := {len(joint) for joint in joints.values()} - {robot.joint_count}:
         words = f"there are {min(counts)} joint angles a row, and {robot.name} has "
-        words = f"{words}{robot.joint_count} joints."
+        wanted = [f"q{at + 1}_rad" for at in range(min(counts), robot.joint_count)]
+        beside = of_other_units(wanted, rows[0].text) if rows else ""
+        words = f"{words}{robot.joint_count} joints{beside}."
         step = "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
         if not by_view:
             raise DataError(f"views.csv: {words}", next_step=step)

@@ -35,6 +35,7 @@ from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending, or_alone
 from visioncal.estimation.chain import robot_part
 from visioncal.session import frame_name
+from visioncal.session.columns import POSE
 from visioncal.session.frames import object_name
 
 # A robot that moves by less stood still [m].
@@ -98,7 +99,15 @@ def with_misreading(run: RunState) -> RunState:
 
     Misread joints were reported before: they would mislead this search.
     """
-    return run if run.misread is not None else replace(run, misread=(*islice(misreadings(run), 1),))
+    if run.misread is not None:
+        return run
+    found = (*islice(misreadings(run), 1),)
+    joints = [warning for warning in run.warnings if warning.kind == "misread_joints"]
+    # Poses by angles whose mistake is known are those of no other mistake.
+    if found and joints and not any(POSE[0] in view.numbers for view in run.session.views):
+        rest = tuple(warning for warning in run.warnings if warning not in joints)
+        return replace(run, misread=(replace(joints[0], kind=found[0].kind),), warnings=rest)
+    return replace(run, misread=found)
 
 
 def with_open_chains(run: RunState) -> RunState:
