@@ -23,7 +23,7 @@ from visioncal.planning.candidates import candidates
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.design import Design, choose_stops
 from visioncal.planning.information import WORLDS, predict_worlds, stop_factors
-from visioncal.planning.path import order_stops
+from visioncal.planning.path import Route, left_candidates, order_stops
 from visioncal.planning.purposes import PURPOSES, Purpose
 from visioncal.planning.recorded import SessionStart, start_from_session
 from visioncal.planning.visibility import FieldOfView
@@ -331,6 +331,15 @@ def test_a_box_in_the_way_is_gone_around():
     shares = np.linspace(0.0, 1.0, 60)[:, None]
     moved = np.vstack([p + shares * (q - p) for p, q in itertools.pairwise(way)])
     assert least_clearance(replace(cell, boxes=(wall,)), moved) >= cell.limits.clearance_m
+
+
+def test_a_stop_out_of_reach_is_replaced_by_one_nearer_to_others():
+    """Each would be replaced by another in the same part of the workspace."""
+    q = np.array([[0.0], [0.4], [1.6], [1.8], [2.0]])
+    route = Route((0,), (np.zeros((0, 1)),), 0.0, {1: "link j2 and link j5"})
+    left, chosen = np.arange(5), np.array([0, 4])
+    assert left_candidates(q, left, chosen, route, alone=True).tolist() == [0, 1, 2, 3]
+    assert left_candidates(q, left, chosen, route, alone=False).tolist() == [0, 1]
 
 
 def test_a_start_in_contact_is_refused_by_name():

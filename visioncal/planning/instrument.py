@@ -33,7 +33,7 @@ from visioncal.planning.information import (
     with_arm_errors,
     workspace_jacobian,
 )
-from visioncal.planning.path import order_stops
+from visioncal.planning.path import left_candidates, order_stops
 from visioncal.planning.purposes import Purpose
 from visioncal.planning.visibility import Occlusion
 
@@ -143,7 +143,7 @@ def plan_for_instrument(
     left = np.arange(len(candidates))
     with one_blas_thread():
         world = _world(cell, purpose, candidates, recorded)
-        for _ in range(_ROUNDS):
+        for attempt in range(_ROUNDS):
             design = choose_stops([world.of_candidates(left)], count, criterion)
             q = candidates[left[design.rows]]
             route = order_stops(cell, start_q, q, seed)
@@ -154,7 +154,8 @@ def plan_for_instrument(
                 return InstrumentPlan(
                     cell, purpose, criterion, q, via, design, candidates, recorded
                 )
-            left = np.delete(left, design.rows[list(route.unreachable)])
+            chosen = left[design.rows]
+            left = left_candidates(candidates, left, chosen, route, alone=not attempt)
             if len(left) < count:
                 break
     raise DataError(

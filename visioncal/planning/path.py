@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.planning.cell import AnyCell
 from visioncal.robot.collision import Collisions
 
@@ -112,6 +112,30 @@ class Route:
     length_rad: float  # Length of the path, as the sum of its segments' norms.
     # Rows to which no safe path was found, with the pair of bodies that collides.
     unreachable: Mapping[int, str]
+
+
+def left_candidates(
+    q: FloatArray, left: IntArray, chosen: IntArray, route: Route, *, alone: bool
+) -> IntArray:
+    """Candidates from which to choose again, where a route misses chosen stops.
+
+    Args:
+        q: (k, n) joint angles of all candidates [rad].
+        left: Rows of the candidates.
+        chosen: (s,) rows of the stops.
+        route: Its path.
+        alone: Whether only the missed stops go. Otherwise all go that are nearer to these than to
+            reached ones, since each would be replaced by another in the same part of the workspace.
+    """
+    missed = chosen[list(route.unreachable)]
+    reached = np.setdiff1d(chosen, missed)
+    if not alone and len(reached):
+        to_missed, to_reached = (
+            np.linalg.norm(q[left][:, None] - q[rows], axis=2).min(axis=1)
+            for rows in (missed, reached)
+        )
+        missed = left[to_missed < to_reached]
+    return np.setdiff1d(left, missed)
 
 
 def order_stops(cell: AnyCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:

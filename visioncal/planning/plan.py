@@ -17,7 +17,7 @@ from visioncal.planning.candidates import Candidates, candidates
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.design import Accuracy, Design, choose_stops
 from visioncal.planning.information import WORLDS, World, predict_worlds
-from visioncal.planning.path import Route, order_stops
+from visioncal.planning.path import Route, left_candidates, order_stops
 from visioncal.planning.pick_probability import (
     NeedPlanned,
     Picking,
@@ -188,17 +188,9 @@ class _Planning:
             if not route.unreachable:
                 return design, route, tuple(blockers)
             blockers += route.unreachable.values()
-            unreachable = design.rows[list(route.unreachable)]
-            reached = np.setdiff1d(design.rows, unreachable)
-            if attempt and len(reached):
-                # Otherwise each would be replaced by another in the same part of the workspace.
-                q = self.found.q
-                to_lost, to_reached = (
-                    np.linalg.norm(q[remaining][:, None] - q[rows], axis=2).min(axis=1)
-                    for rows in (unreachable, reached)
-                )
-                unreachable = remaining[to_lost < to_reached]
-            remaining = np.setdiff1d(remaining, unreachable)
+            remaining = left_candidates(
+                self.found.q, remaining, design.rows, route, alone=not attempt
+            )
         obstacles = tuple(dict.fromkeys(blockers))
         raise DataError(
             f"plan: no safe way through {self.request.count} stops was found in {_ROUNDS} choices; "
