@@ -306,6 +306,10 @@ def test_temperatures_that_no_arm_begins_with_or_no_sensor_has_are_named():
     (fahrenheit,) = warming(lambda temperatures: 1.8 * temperatures + 32.0)
     assert "begin at 69.8 deg C" in fahrenheit or "begin at 70 deg C" in fahrenheit
     assert "degrees Fahrenheit, of 21 deg C?" in fahrenheit
+    # Motors at work in cool air, and a foundry, are no error of the unit.
+    at_work = warming(lambda temperatures: temperatures + np.repeat([45.0, 0.0], [6, 1]))
+    assert not any("Fahrenheit" in words for words in at_work)
+    assert warming(lambda temperatures: temperatures + 41.0) == []
     (dead,) = warming(with_dead_sensor)
     assert dead.startswith("temp2_c stays at 21 deg C while the other joints warm up by up to 19 K")
     (late,) = warming(from_s=2000.0)

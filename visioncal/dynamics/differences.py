@@ -82,7 +82,10 @@ def _friction_words(identified: Identified, changes: FloatArray) -> str:
     """Words on changes (2 n) of dry and viscous friction, joint by joint."""
     names = [identified.base.model.names[index] for index in identified.base.independent]
     joints = range(1, len(changes) // 2 + 1)
-    own = np.array([identified.values[names.index(f"Fc{joint}")] for joint in joints])
+    known = dict(zip(names, identified.values.tolist(), strict=True))
+    own = np.array([known.get(f"Fc{joint}", 0.0) for joint in joints])
+    if not (own > 0.0).any():
+        return "dry friction acts otherwise, and was not fitted"
     ratio = float(np.median(1.0 + changes[::2] / np.where(own > 0.0, own, np.inf)))
     return f"dry friction was {ratio:.3g} times as much, as of colder or warmer gears"
 

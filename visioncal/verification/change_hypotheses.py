@@ -172,6 +172,8 @@ def _load(
     robot, q = model.robot, arm.joints_rad
     torques = robot.load_torques(q, loads) - robot.load_torques(q)
     greatest = np.abs(torques).max(axis=0)
+    if not greatest.any():
+        return
     bent = greatest > _LEAST_SHARE * greatest.max()
     # Joints of about equal stiffness.
     by_flange = (offsets * (torques / greatest.max())[:, None, :])[:, :, bent]

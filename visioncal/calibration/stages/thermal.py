@@ -47,10 +47,10 @@ LEVEL = "thermal"
 _SETTLED = 1e-3
 # Kind of findings about what was recorded.
 TEMPERATURES = "temperatures"
-# Neither joints nor air have as much at a start [deg C]; a sensor that moves by so small a part of
+# No air, nor an arm that is cold, has as much [deg C]; a sensor that moves by so small a part of
 # what others do is dead, where these warm up by so much [K]; an arm that begins with so much of its
 # whole rise has been at work.
-_HOT_C, _DEAD, _WARM_K, _STARTED = 60.0, 1e-3, 10.0, 0.4
+_HOT_C, _DEAD, _WARM_K, _STARTED = 65.0, 1e-3, 10.0, 0.4
 # In so long a time at the start, joints at rest change by less [s, K].
 _EARLY_S, _EVEN_K = 300.0, 0.25
 # Points of the reported course.
@@ -291,13 +291,17 @@ def doubts(fit: ThermalFit) -> Iterator[Finding]:
     if inputs.kind != "temperatures" or not fit.is_found:
         return
     names, signal = fit.model.robot.joint_names, inputs.signal
-    first, rises = np.append(signal[0], inputs.ambient_c[0]), np.ptp(signal, axis=0)
-    if (hottest := float(first.max())) >= _HOT_C:
+    rises = np.ptp(signal, axis=0)
+    # Motors at work are as hot; the air is not, nor are joints that are cold.
+    is_even = inputs.ambient_c.any() or float(np.ptp(signal[0])) < _WARM_K
+    coldest = float(inputs.ambient_c[0] if inputs.ambient_c.any() else signal[0].min())
+    if is_even and coldest >= _HOT_C:
         yield Finding(
             TEMPERATURES,
-            f"The temperatures begin at {figure(hottest)} deg C, and joints or air at the start "
-            f"have less than {_HOT_C:g}: degrees Fahrenheit, of {figure((hottest - 32.0) / 1.8)} "
-            "deg C? Growth per kelvin is then 1.8 times too small.",
+            f"The temperatures begin at {figure(coldest)} deg C, and neither the air nor an arm "
+            f"that is cold has {_HOT_C:g}: degrees Fahrenheit, of "
+            f"{figure((coldest - 32.0) / 1.8)} deg C? Growth per kelvin is then 1.8 times too "
+            "small.",
             Remedy("Write temp1_c ... and ambient_c in degrees Celsius: (F - 32) / 1.8."),
         )
     dead = (rises <= _DEAD * rises.max()) & (np.median(rises) >= _WARM_K)

@@ -66,17 +66,17 @@ class JointsCreep(_ZerosMove, Named):
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
         """Evenly; as what warms up; as what settles in the first stops."""
-        if stood.robot is not None:
+        # Sliding joints have other sizes; their creep is that of frames.
+        if stood.robot is not None and not stood.robot.chain.prismatic.any():
             yield from (cls(flange, stood.robot, rate) for rate in RATES)
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
-        most = int(np.argmax(np.abs(values)))
+        up_to_deg = float(np.rad2deg(np.abs(values).max()))
         return (
-            "The joints' zeros crept during the session, as of an arm that warms up or cools: that "
-            f"of joint {most + 1} by {figure(abs(float(np.rad2deg(values[most]))))} deg. The "
-            "result is that of its end."
+            f"The joints' zeros crept during the session, by up to {figure(up_to_deg)} deg, as of "
+            "an arm that warms up or cools. The result is that of its end."
         )
 
     def left(self, moments: Moments) -> FloatArray:

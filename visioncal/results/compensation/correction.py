@@ -156,7 +156,7 @@ def unseen(
         seen = np.array([max(map(abs, joint.torque_nm)) for joint in elastic.joints])
         over = (borne - _BEYOND * seen) * (elastic.compliance + elastic.sigmas)
         at = int(np.argmax(over))
-        if over[at] > 0.0 and len(over):
+        if over[at] > 0.0:
             unit = "kilograms, and the centre in metres? " * bool(
                 borne.max() > _ABSURD * elastic.most_nm
             )
