@@ -81,8 +81,10 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
-        if is_creeping and finding.kind in STEPS and share < 0.2:
-            # Creep of another course than the fitted one leaves a small step: a tenth of the power.
+        powers = np.square(trial.levels[1] / np.maximum(trial.levels[0], np.finfo(float).tiny))
+        if is_creeping and finding.kind in STEPS and powers.min() > 0.75:
+            # Creep of another course than the fitted one leaves a step, which takes less than a
+            # quarter of the noise beside it, of shifts as of turns.
             continue
         is_apart = bool(trial.is_in_fit and CLEAR_RATIO**2 * left[1] < left[0])
         if is_apart:
