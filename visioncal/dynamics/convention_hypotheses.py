@@ -20,6 +20,7 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import JointMotion, Measured, sign
 from visioncal.robot import Robot
 from visioncal.robot.inertia import Inertias
+from visioncal.robot.loads import gravity_words
 from visioncal.robot.torques import body_regressor, joint_torques
 
 # Least number of a test's samples: sweeps of single joints have fewer.
@@ -84,8 +85,8 @@ def _check_conventions(base: BaseModel, label: str, measured: Measured, *, known
     step = "Mend the columns of the stream, or name the robot that was recorded."
     if best.gravity is not None:
         step = (
-            f"Write gravity_m_s2 = {_vector(best.gravity)} under [robot] in session.toml if it is "
-            "mounted so, or name the robot that was recorded."
+            f"Write gravity_m_s2 = {gravity_words(best.gravity)} under [robot] in session.toml if "
+            "it is mounted so, or name the robot that was recorded."
         )
     raise DataError(
         f"{label}: {', or '.join(alike)}: so taken, {so_taken:.3g} % of the torques of "
@@ -177,13 +178,10 @@ def _other_mounts(robot: Robot, measured: Measured, *, known: bool) -> Iterator[
             others.append(found)
     for gravity in others:
         if gravity @ robot.gravity < _ALIGNED * size**2:
-            words = f"the base is not mounted as stated, but has gravity along {_vector(gravity)}"
+            words = (
+                f"the base is not mounted as stated, but has gravity along {gravity_words(gravity)}"
+            )
             yield _Mistake(words, every, same, same, gravity)
-
-
-def _vector(values: FloatArray) -> str:
-    # Adding 0.0 removes negative zeros.
-    return f"[{', '.join(f'{value:.3g}' for value in np.round(values, 2) + 0.0)}]"
 
 
 def _gravity_direction(robot: Robot, measured: Measured) -> FloatArray:

@@ -149,8 +149,8 @@ class Identified:
         """The consistent standard parameters; raises DataError where there are none."""
         if self.consistent is None:
             raise DataError(
-                f"dynamics: the inertias of {self.robot.name} were not known, so its links have "
-                "none.",
+                f"dynamics: the inertias of {self.robot.name} were not known when it was "
+                "identified, so its links have none.",
                 culprits=[self.robot.name],
                 next_step="State mass_kg, com_m and inertia_kg_m2 of its joints, and identify "
                 "again.",

@@ -209,7 +209,7 @@ def robot_of(session: Session) -> Robot:
     check_one_of_each(session)
     if session.robot_document is None:
         raise DataError(
-            f"session {session.name!r} names no known robot, whose links torques need.",
+            f"session {session.name!r} names no known robot, and torques are those of its links.",
             culprits=["session.toml: robot.model"],
             next_step=" ".join(session.warnings)
             or 'Add model = "ur10e", or a path, to [robot], of a whole cell to its table, as '

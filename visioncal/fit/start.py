@@ -30,7 +30,7 @@ from visioncal.session.document import CameraTable
 from visioncal.vision.camera import project
 from visioncal.vision.intrinsics import estimate_intrinsics
 from visioncal.vision.poses import closed_form_poses, determines_pose
-from visioncal.vision.targets import corner_positions, first_corners, rotation_transforms, rotations
+from visioncal.vision.targets import corner_positions, first_numbers, rotation_transforms, rotations
 
 # Most images of which a lens is estimated.
 _IMAGES = 40
@@ -187,8 +187,8 @@ def _by_corners(cell: Cell, frame: str, table: CameraTable) -> Camera:
     # Corners on a line, or a few beside many, mislead the closed form of focal lengths.
     typical = np.median([len(s.corners.ids) for s in seen.values() if s.corners])
     names = tuple(dict.fromkeys(s.seen for s in seen.values()))
-    boards = [cell.boards[name] for name in names]
-    firsts = dict(zip(names, first_corners(boards).tolist(), strict=True))
+    boards = {name: cell.boards[name] for name in names}
+    firsts = first_numbers(boards)
     corners = {
         at: replace(s.corners, ids=s.corners.ids + firsts[s.seen])
         for at, s in seen.items()
@@ -201,7 +201,7 @@ def _by_corners(cell: Cell, frame: str, table: CameraTable) -> Camera:
     most = np.max([np.ones(2), *(at.px.max(axis=0) for at in corners.values())], axis=0)
     size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
     try:
-        return estimate_intrinsics(corners, boards, size, table.model).camera
+        return estimate_intrinsics(corners, [*boards.values()], size, table.model).camera
     except (ConvergenceError, DegenerateError):
         none = np.zeros(4 if table.model == "fisheye" else 5)
         return Camera(table.model, size, np.array([1.0, 1.0, *size]), none)

@@ -366,8 +366,8 @@ class ThermalResult(Section):
     def seen_c(self) -> tuple[float, float]:
         """Lowest and highest temperature of a link in the session [deg C]."""
         references = [joint.reference_c for joint in self.joints]
-        rises = [point.rise_k for point in self.course]
-        return min(references) + min(*rises, 0.0), max(references) + max(*rises, 0.0)
+        rises = [0.0, *(point.rise_k for point in self.course)]
+        return min(references) + min(rises), max(references) + max(rises)
 
     def model(self, robot: Robot) -> ThermalModel:
         """Thermal model of the arm; `robot` is the arm at its reference temperatures."""

@@ -170,6 +170,12 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
     return gravity
 
 
+def gravity_words(gravity: FloatArray) -> str:
+    """A (3,) gravity [m/s^2] as session.toml states it: `[0, 0, -9.81]`."""
+    # Adding 0.0 removes negative zeros.
+    return f"[{', '.join(f'{value:.3g}' for value in np.round(gravity, 2) + 0.0)}]"
+
+
 @dataclass(frozen=True, eq=False)
 class DriveLimits:
     """Limits of an arm's drives; inf where unknown, in m/s, m/s^2 and N for prismatic joints."""

@@ -261,6 +261,11 @@ def first_corners(targets: Sequence[Target]) -> IntArray:
     return np.cumsum([0, *counts], dtype=np.int64)[:-1]
 
 
+def first_numbers(boards: Mapping[str, Target]) -> dict[str, int]:
+    """Numbers of boards' first corners where those of all are numbered through, by their names."""
+    return dict(zip(boards, first_corners(tuple(boards.values())).tolist(), strict=True))
+
+
 def otherwise(target: Target, corners: Sequence[Corners]) -> dict[str, object]:
     """Keys of a description that a detector's corners contradict, as they should be."""
     return kind_of(target).otherwise(target, [at.ids for at in corners], [at.px for at in corners])

@@ -260,10 +260,10 @@ class RobotArm:
         The errors are those of the calibrated model, else of any link, else of the pose.
         """
         if self.matched is None or self.joints_rad is None:
-            return self._by_stop(pose_basis(self.reported[self.has_pose]))
+            return self.by_stop(pose_basis(self.reported[self.has_pose]))
         if self.model is None:
-            return self._by_stop(link_basis(self.matched.robot, self.joints_rad))
-        return self._by_stop(self.model.basis(self.joints_rad, self.loads))
+            return self.by_stop(link_basis(self.matched.robot, self.joints_rad))
+        return self.by_stop(self.model.basis(self.joints_rad, self.loads))
 
     @property
     def joint_offsets(self) -> FloatArray | None:
@@ -272,7 +272,7 @@ class RobotArm:
             return None
         nominal = ArmModel.of(self.matched.robot, self.joints_rad, self.reported[self.has_pose])
         model = self.model or nominal
-        return self._by_stop(model.columns("offsets", self.joints_rad, self.loads))
+        return self.by_stop(model.columns("offsets", self.joints_rad, self.loads))
 
     def with_level(
         self,
@@ -299,11 +299,11 @@ class RobotArm:
         for robot in self._hypotheses(used.loads):
             model = ArmModel.of(robot, q, used.reported).loaded(q, used.loads)
             bases = {
-                name: self._by_stop(model.columns(name, every, self.loads))
+                name: self.by_stop(model.columns(name, every, self.loads))
                 for name in blocks_of(model.nominal, self.loads)
             }
             harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
-            waves = None if harmonics is None else self._by_stop(harmonics)
+            waves = None if harmonics is None else self.by_stop(harmonics)
             kinematics = select_errors(
                 problem, start, self.robot, bases, model.torque_nm, asked, noise, waves
             )
@@ -355,8 +355,8 @@ class RobotArm:
         arm, first = replace(self, model=model), next(iter(self.kinematics.fit.errors.values()))
         return replace(arm, errors=replace(first, basis=arm.basis))
 
-    def _by_stop(self, columns: FloatArray) -> FloatArray:
-        """(m, 6, p) spread over all stops, (s, 6, p): zero where the robot has no pose."""
+    def by_stop(self, columns: FloatArray) -> FloatArray:
+        """(m, ...) rows of posed stops, spread over all s stops: zero where it has no pose."""
         scattered = np.zeros((len(self.has_pose), *columns.shape[1:]))
         scattered[self.has_pose] = columns
         return scattered

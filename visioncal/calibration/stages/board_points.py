@@ -30,7 +30,7 @@ from visioncal.vision.corners import (
 )
 from visioncal.vision.lens_field import row_motions, zooms
 from visioncal.vision.poses import fit_poses
-from visioncal.vision.targets import corner_positions, first_corners
+from visioncal.vision.targets import corner_positions, first_numbers
 
 T = TypeVar("T", bound=Observed)
 # Fewest views of which the scatter of a mean is known, and most that are needed.
@@ -92,8 +92,8 @@ def with_board_points(seen: T) -> T:
 def _errors(seen: Observed) -> Iterator[tuple[str, str, int, PointErrors]]:
     """Errors of printed boards by each camera: board, camera, the board's first corner, errors."""
     boards = seen.session.boards
-    first = first_corners(tuple(boards.values())).tolist()
-    for index, ((name, target), start) in enumerate(zip(boards.items(), first, strict=True)):
+    for index, (name, start) in enumerate(first_numbers(boards).items()):
+        target = boards[name]
         for frame, look in seen.cameras.items():
             views = {
                 view: replace(corners, ids=corners.ids - start)

@@ -32,7 +32,7 @@ from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
-from visioncal.vision.targets import first_corners
+from visioncal.vision.targets import first_numbers
 
 T = TypeVar("T", bound=Observed)
 
@@ -100,17 +100,11 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
     return with_stop_means(without_repeats(seen))
 
 
-def first_numbers(session: Session) -> dict[str, int]:
-    """Numbers of boards' first corners where those of all are numbered through, by their names."""
-    firsts = first_corners(tuple(session.boards.values())).tolist()
-    return dict(zip(session.boards, firsts, strict=True))
-
-
 def _numbered(
     session: Session, views: Sequence[View], corners: Mapping[int, Corners]
 ) -> dict[int, Corners]:
     """Corners of some views, those of several boards numbered through."""
-    starts = first_numbers(session)
+    starts = first_numbers(session.boards)
     return {
         view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
         for view in views

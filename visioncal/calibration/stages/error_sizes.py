@@ -30,7 +30,7 @@ from visioncal.model.effects.effect import LensEffect
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics, project, project_with_jacobian
 from visioncal.vision.lens_field import LensLevels, lens_part
-from visioncal.vision.targets import corner_positions, first_corners
+from visioncal.vision.targets import corner_positions, first_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,10 +288,7 @@ def session_start(observed: Observed, reference: str = "", *, has_priors: bool =
 
 def _own_corners(observed: Observed) -> dict[int, Corners]:
     """The corners of the views that a fit may use, each numbered on its own board."""
-    session = observed.session
-    starts = dict(
-        zip(session.boards, first_corners(tuple(session.boards.values())).tolist(), strict=True)
-    )
+    session, starts = observed.session, first_numbers(observed.session.boards)
     board_of = {view.number: session.board_of(view) for view in session.views}
     return {
         view: replace(corners, ids=corners.ids - starts[board_of[view]])

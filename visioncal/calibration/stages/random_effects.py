@@ -61,12 +61,10 @@ def random_effects(
 
 def _of_flange(at: OpenedEffect, problem: Problem, arm: RobotArm) -> Effect:
     """An effect on a flange, as it moves the poses of its robot."""
-    robot, joints = arm.robot, dict[str, FloatArray]()
+    robot = arm.robot
     poses = np.where(np.isfinite(problem.poses[robot]), problem.poses[robot], np.eye(4))
     effect, count = replace(at.effect, frame=robot), len(poses)
-    if arm.joints_rad is not None:
-        joints[robot] = np.zeros((count, arm.joints_rad.shape[1]))
-        joints[robot][arm.has_pose] = arm.joints_rad
+    joints = {} if arm.joints_rad is None else {robot: arm.by_stop(arm.joints_rad)}
     moments = Moments({robot: poses}, joints, even_progress(count), np.arange(count))
     seen, unseen = effect.columns(moments, np.ones(count)), effect.unseen(moments)
     columns = np.append(seen, unseen, axis=2)

@@ -81,8 +81,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
-        powers = np.square(trial.levels[1] / np.maximum(trial.levels[0], np.finfo(float).tiny))
-        if is_creeping and finding.kind in STEPS and powers.min() > 0.75:
+        leaves_most = (trial.levels[1] ** 2 > 0.75 * trial.levels[0] ** 2).all()
+        if is_creeping and finding.kind in STEPS and leaves_most:
             # Creep of another course than the fitted one leaves a step, which takes less than a
             # quarter of the noise beside it, of shifts as of turns.
             continue

@@ -15,7 +15,7 @@ from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cameras import exchanged_columns, first_numbers
+from visioncal.calibration.stages.cameras import exchanged_columns
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.other_board import MEND_IMAGES
@@ -37,6 +37,7 @@ from visioncal.estimation.chain import robot_part
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
 from visioncal.session.frames import object_name
+from visioncal.vision.targets import first_numbers
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -389,7 +390,7 @@ def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
     """A cell's run as that of one robot, camera and target alone."""
     session = run.session.of(pair.camera, robot, pair.target)
     views = {view.number for view in session.views}
-    first = first_numbers(run.session).get(object_name(pair.target, "target"), 0)
+    first = first_numbers(run.session.boards).get(object_name(pair.target, "target"), 0)
     cameras = dict[str, CameraObservations]()
     # Of poses that are given there are no corners.
     if (look := run.cameras.get(pair.camera)) is not None:

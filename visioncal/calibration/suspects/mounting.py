@@ -18,9 +18,9 @@ from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.robot import Robot
+from visioncal.robot.loads import gravity_words
 
-# Kind of the finding, and size of gravity [m/s^2].
-KIND, _G_M_S2 = "mounting", 9.81
+KIND = "mounting"  # Of the finding.
 # Twice the gain in log-likelihood that chance leaves to one of five directions in a million.
 _CLEAR = 30.0
 
@@ -41,8 +41,9 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     home = np.zeros((1, known.joint_count))
     moved = (known.base_from_flange(home) @ invert(declared.base_from_flange(home)))[0]
     tried = list[tuple[SelectedArmLevel, FloatArray]]()
-    for axis in _G_M_S2 * np.concatenate([np.eye(3), -np.eye(3)]):
-        is_stated = axis @ declared.gravity > 0.9 * _G_M_S2**2
+    size = float(np.linalg.norm(declared.gravity))
+    for axis in size * np.concatenate([np.eye(3), -np.eye(3)]):
+        is_stated = axis @ declared.gravity > 0.9 * size**2
         level = None if is_stated else _level(run, arm, moved[:3, :3] @ axis)
         if level is not None:
             tried.append((level, axis))
@@ -53,7 +54,7 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     before_mm, after_mm = (at.fit.result.held_out_mm for at in (own, level))
     if gain < _CLEAR or CLEAR_RATIO * after_mm > before_mm:
         return None
-    line = f"gravity_m_s2 = [{', '.join(f'{value:g}' for value in axis + 0.0)}]"
+    line = f"gravity_m_s2 = {gravity_words(axis)}"
     was = "stated" if "gravity_m_s2" in declared.document else "assumed, since none is stated"
     return Finding(
         KIND,
@@ -68,8 +69,7 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
 
 def _level(run: RunState, arm: RobotArm, gravity: FloatArray) -> SelectedArmLevel | None:
     """The errors of an arm with (3,) gravity in the base of its poses [m/s^2]."""
-    cell_fit, used = run.cell_fit, np.flatnonzero(run.cell_fit.inlier_fit.used)
-    views = [cell_fit.cell.rows[at].view for at in used]
+    cell_fit = run.cell_fit
 
     def with_gravity(other: RobotArm, nominal: Problem, start: State) -> RobotArm:
         matched = other.matched
@@ -79,7 +79,7 @@ def _level(run: RunState, arm: RobotArm, gravity: FloatArray) -> SelectedArmLeve
         document = {**robot.document, "gravity_m_s2": gravity.tolist()}
         robot = replace(robot, document=document, gravity=gravity)
         other = replace(other, matched=replace(matched, robot=robot), model=None)
-        return other.with_level(nominal, start, cell_fit.level, views, cell_fit.noise)
+        return other.with_level(nominal, start, cell_fit.level, run.used, cell_fit.noise)
 
     return change_each(cell_fit.arms, cell_fit.fit, with_gravity)[arm.robot].kinematics
 
