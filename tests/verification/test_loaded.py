@@ -159,10 +159,13 @@ def test_an_arm_whose_weight_is_compensated_bends_by_its_load_alone():
 
 def test_the_command_writes_beside_and_never_over_the_unloaded_arm(tmp_path, unloaded):
     loaded().save(tmp_path / "loaded")
-    (tmp_path / "out").mkdir()
-    unloaded.save(tmp_path / "out" / "calibration.json")
-    asked = ("calibrate", tmp_path / "loaded", "--against", tmp_path / "out", "-o")
-    command(*asked, tmp_path / "out").refused("is the calibration of the unloaded arm itself")
+    first = tmp_path / "first out"
+    first.mkdir()
+    # Its steps name it, as those of a calibration by a command do.
+    verdict = unloaded.verdict.with_paths(tmp_path / "unloaded", first)
+    replace(unloaded, verdict=verdict).save(first / "calibration.json")
+    asked = ("calibrate", tmp_path / "loaded", "--against", first, "-o")
+    command(*asked, first).refused("is the calibration of the unloaded arm itself")
     told = command(*asked, tmp_path / "stiff").good()
     assert "joint_2" in told.out
     # Steps are taken with the stiffness just found.

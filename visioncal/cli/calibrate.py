@@ -1,5 +1,6 @@
 """`visioncal calibrate`."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,8 +85,9 @@ def _calibrate_loaded(options: CalibrateOptions, loaded: Session, against: Path)
     stiff, findings = calibrate_loaded(loaded, load_calibration(against)), list[Finding]()
     for finding in stiff.verdict.findings:
         # Steps with the unloaded result are taken with this one.
-        parts = finding.do.command.split(" ") if finding.do is not None else []
-        command = " ".join("OUT" if Path(at).absolute() == folder else at for at in parts)
+        parts = shlex.split(finding.do.command, posix=False) if finding.do is not None else []
+        paths = ["OUT" if Path(at.strip("'")).absolute() == folder else at for at in parts]
+        command = " ".join(paths)
         do = finding.do and replace(finding.do, command=command)
         findings.append(replace(finding, do=do))
     verdict = replace(stiff.verdict, findings=tuple(findings))
