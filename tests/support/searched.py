@@ -4,6 +4,7 @@ import hashlib
 import pickle
 from copy import deepcopy
 from dataclasses import replace
+from importlib import import_module
 
 from visioncal.calibration.pipeline import mended_images
 from visioncal.calibration.stages import detect, other_board
@@ -37,4 +38,6 @@ SEARCHES = [
     (detect, "corners_in", corners_in),
     (other_board, "identify", _identify),
     (mended_images, "identify", _identify),
+    # The package offers a function of the module's name.
+    (import_module("visioncal.interchange.formats.assemble"), "identify", _identify),
 ]
