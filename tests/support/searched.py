@@ -9,7 +9,9 @@ from importlib import import_module
 from visioncal.calibration.pipeline import mended_images
 from visioncal.calibration.stages import detect, other_board
 from visioncal.core.types import Corners
+from visioncal.verification import scene_audit
 from visioncal.vision.boards.identify import identify
+from visioncal.vision.scene import register
 
 
 def _once(search):
@@ -40,4 +42,5 @@ SEARCHES = [
     (mended_images, "identify", _identify),
     # The package offers a function of the module's name.
     (import_module("visioncal.interchange.formats.assemble"), "identify", _identify),
+    (scene_audit, "register", _once(register)),
 ]
