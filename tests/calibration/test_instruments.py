@@ -57,17 +57,28 @@ def test_errors_follow_their_covariance(options):
     assert low < squares < high
 
 
-@pytest.mark.parametrize("stated", [[0, 0, 9.81], [-9.81, 0, 0]])
-def test_an_arm_whose_mounting_is_not_as_stated_is_named_with_its_gravity(stated):
+@pytest.fixture(scope="module")
+def bending():
+    """Readings of a standing arm that bends, and what is known where its gravity is stated so."""
     bends = {"payloads": CARRIED, "compliance_rad_per_nm": tuple(1.0 / np.array(COBOT))}
     shop = tracked(replace(POINT, stops=40, **bends))
-    known = known_of(session_of(shop, robot={"model": "ur10e", "gravity_m_s2": stated}))
+    return shop, known_of(stating_gravity(shop, [0, 0, -9.81]))
+
+
+def stating_gravity(shop, stated):
+    """The session of readings with gravity as it is stated."""
+    return session_of(shop, robot={"model": "ur10e", "gravity_m_s2": stated})
+
+
+@pytest.mark.parametrize("stated", [[0, 0, 9.81], [-9.81, 0, 0]])
+def test_an_arm_whose_mounting_is_not_as_stated_is_named_with_its_gravity(bending, stated):
+    shop, right = bending
+    known = known_of(stating_gravity(shop, stated))
     first = known.verdict.causes[0]
     assert first.kind == "mounting"
     assert first.probability > 0.99
     assert "Write gravity_m_s2 = [0, 0, -9.81] under [robot]" in first.do.words
     assert not any("run out" in finding.words for finding in known.verdict.findings)
-    right = known_of(session_of(shop, robot={"model": "ur10e", "gravity_m_s2": [0, 0, -9.81]}))
     assert right.verdict.status == "good"
 
 
