@@ -154,7 +154,7 @@ def test_cameras_that_have_each_others_images_from_a_stop_on_are_no_moves():
 
 
 def test_the_joint_covariance_is_in_the_order_of_the_transforms_where_a_frame_moved():
-    found = solved(simulate(replace(PLAIN, moved=(Moved("cam_left", 9),), seed=3)))
+    found = solved(simulate(replace(PLAIN, moved=(Moved("cam_left", 6),), stops=12, seed=3)))
     assert [value.frame for value in found.cell.moved] == ["cam_left"]
     for at, edge in enumerate(found.edges.values()):
         block = found.joint_covariance[6 * at :, 6 * at :][:6, :6]
@@ -201,7 +201,8 @@ def test_a_base_that_was_pushed_is_one_finding(stop):
 
 @pytest.mark.parametrize("frame", ["cam_right", slow("target_floor")])
 def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
-    cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))
+    crept = Moved(frame, creeps=True, shift_m=0.012)
+    cell = simulate(replace(PLAIN, moved=(crept,), stops=14, seed=3))
     found = solved(cell)
     assert not found.cell.moved
     assert all(view.used for view in found.views)
