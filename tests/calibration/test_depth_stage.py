@@ -373,7 +373,7 @@ def test_picks_by_depth_are_within_their_radius(mount, count):
 
 
 def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
-    cell, _, result = calibrated(1, "eye-to-hand", FALSE, 12)
+    cell, _, result = calibrated(1, "eye-to-hand", FALSE, 8)
     calibration = result.calibration
     pose = calibration.edges["base_from_cam"].matrix
     # The table z = 0.1 of the base, seen along every fifth pixel by the true camera.

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.commands import visioncal
+from support.depth_cells import SMALL
 from support.marks import slow
 
 from visioncal.calibration.run import run
@@ -23,7 +24,8 @@ DRAWS = False
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory):
     folder = tmp_path_factory.mktemp("elsewhere")
-    write_session(simulate(CellOptions(views=6, seed=2)), folder / "cell")
+    options = CellOptions(camera=SMALL, blur_px=0.5, views=6, seed=2)
+    write_session(simulate(options), folder / "cell")
     session = Session.load(folder / "cell")
     return session, run(session)
 
