@@ -228,8 +228,67 @@ def test_a_robot_whose_poses_are_misread_is_named_first(three):
         calibrate(replace(three, views=tuple(map(turned, three.views))))
     words = "Robot b: With the robot's rotations as a quaternion w, x, y, z, robot and camera"
     assert str(refused.value).startswith(words)
-    # A command that reads the session otherwise would change both robots.
-    assert refused.value.next_step.endswith("correct the files by hand.")
+    # The command reads the rows of this robot anew, and none else.
+    assert "visioncal convert SESSION FIXED --guess --yes && " in refused.value.next_step
+
+
+def misread(session, changes):
+    """The session with the poses of some robots, by name, changed by functions of (4, 4) poses."""
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    for view, row in zip(session.views, cells, strict=True):
+        at = view.base_from_flange()
+        if at is not None and view.text["robot"] in changes:
+            numbers = pose_row(changes[view.text["robot"]](at.as_matrix()))
+            row.update({name: str(number) for name, number in numbers.items()})
+    rows = [[row[name] for name in session.columns] for row in cells]
+    return session.with_content(document=session.document, cells=rows)
+
+
+def in_mm(matrix):
+    return matrix * np.append(np.ones(3), 1e3)
+
+
+@pytest.mark.parametrize(
+    "changes", [slow({"a": in_mm}), slow({"b": invert}), {"a": in_mm, "b": invert}]
+)
+def test_robots_of_a_cell_are_read_anew_one_by_one(tmp_path, monkeypatch, three, changes):
+    monkeypatch.chdir(tmp_path)
+    misread(three, changes).save("cell")
+    found = visioncal("doctor", "cell").said
+    line = next(at for at in found.splitlines() if "convert cell" in at)
+    assert line.strip().startswith("visioncal convert cell cell-fixed --guess --yes && ")
+    said = visioncal("convert", "cell", "cell-fixed", "--guess", "--yes").good().said
+    mended = Session.load("cell-fixed")
+    assert [f"Robot {name}:" in said for name in "ab"] == [name in changes for name in "ab"]
+    assert len(mended.declaration.corrected) == len(changes)
+    for before, after in zip(three.views, mended.views, strict=True):
+        first, second = before.base_from_flange(), after.base_from_flange()
+        assert (first is None) == (second is None)
+        if first is not None and second is not None:
+            # To the digits of what was written.
+            np.testing.assert_allclose(second.as_matrix(), first.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_sound_cell_stays_as_it_is_where_other_readings_are_tried(tmp_path, monkeypatch, three):
+    monkeypatch.chdir(tmp_path)
+    three.save("cell")
+    visioncal("convert", "cell", "copy", "--guess", "--yes").good()
+    assert Session.load("copy").digest() == Session.load("cell").digest()
+
+
+@pytest.mark.slow
+def test_a_reading_of_more_than_a_robots_poses_is_left_to_the_user(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session = cell_session(simulate(replace(OPTIONS, stops=12)), "cell", seen="poses")
+    names = ("cft_x_m", "cft_y_m", "cft_z_m")
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    for row in cells:
+        row.update({name: str(1e3 * float(row[name])) for name in names if row[name]})
+    rows = [[row[name] for name in session.columns] for row in cells]
+    session.with_content(document=session.document, cells=rows).save("cell")
+    refused = visioncal("convert", "cell", "cell-fixed", "--guess", "--yes")
+    refused.refused("changes more than the poses of this robot: nothing was written")
 
 
 @pytest.mark.slow

@@ -24,12 +24,13 @@ from support.whole_cells import OPTIONS, recorded
 import visioncal
 from visioncal.calibration.pipeline import mended_images
 from visioncal.calibration.pipeline.explaining import explained
+from visioncal.calibration.pipeline.guess_inputs import of_pair
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.stages.robots import pairs_of
-from visioncal.calibration.suspects.misread_poses import _of_pair, misreadings
+from visioncal.calibration.suspects.misread_poses import misreadings
 from visioncal.calibration.suspects.record import Edges, Record
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
@@ -1016,9 +1017,17 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
         others = [at.number for at in session.views if at.number not in causes[0].views]
         assert causes[0].do.command.endswith(f"--views {ranges(others)}")
         return
-    # The command that mends it is of one robot alone.
-    assert not causes[0].do.command
-    assert causes[0].do.words.endswith("Of several robots or cameras, correct the files by hand.")
+    # The command that mends it is of all rows of one robot at the stops that are apart.
+    of_b = {at.number: at.stop for at in session.views if at.text.get("robot") == "b"}
+    stops = {of_b[view] for view in causes[0].views}
+    apart = [view for view, stop in of_b.items() if min(stops) <= stop <= max(stops)]
+    assert f"--shift {ranges(apart)}:-1 && " in causes[0].do.command
+    assert {*apart} >= {*causes[0].views}
+    mended = visioncal.calibrate(shift_views(session, apart, -1))
+    sound = visioncal.calibrate(in_a_cell(seed, "nothing")[0])
+    before, after = ({at.view for at in each.views if at.used} for each in (sound, mended))
+    # No pose is left for the first, and stops beyond that this pair does not show may stay wrong.
+    assert {view for view in before - after if min(apart) < view <= max(apart)} == set()
 
 
 def test_a_camera_that_is_declared_on_another_robot_is_named_with_its_own():
@@ -1031,9 +1040,11 @@ def test_a_camera_that_is_declared_on_another_robot_is_named_with_its_own():
     assert 'Write cam_hand = "flange_a" in [frames]' in found.do.words
 
 
-def test_rows_of_a_whole_cell_are_not_shifted_together():
+def test_rows_of_several_robots_are_not_shifted_together():
     session = in_a_cell(0, "nothing")[0]
-    raised(DataError, "has several robots or cameras", shift_views, session, [3, 4], 1)
+    of_b = [at.number for at in session.views if at.text.get("robot") == "b"]
+    refused = raised(DataError, "not all of one robot", shift_views, session, [0, *of_b[:2]], 1)
+    assert refused.culprits == ("--shift",)
 
 
 def test_corners_of_other_boards_are_no_corners_of_a_pair_of_a_cell():
@@ -1041,7 +1052,7 @@ def test_corners_of_other_boards_are_no_corners_of_a_pair_of_a_cell():
     for stage in STAGES[:5]:
         run = stage.run(run)
     pair = next(one for one in pairs_of(run, "b") if one.target == "target_plate_b")
-    alone = _of_pair(run, "b", pair)
+    alone = of_pair(run, "b", pair)
     (look,) = alone.cameras.values()
     (board,) = alone.session.boards.values()
     assert max(corners.ids.max() for corners in look.corners.values()) < len(

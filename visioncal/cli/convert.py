@@ -10,7 +10,13 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
-from visioncal.interchange.formats import DoubtfulSession, ImportOptions, PoseImportOptions, convert
+from visioncal.interchange.formats import (
+    DoubtfulRobot,
+    DoubtfulSession,
+    ImportOptions,
+    PoseImportOptions,
+    convert,
+)
 from visioncal.results import Calibration
 
 # Options that are named as the import's.
@@ -76,10 +82,12 @@ def import_options(
     )
 
 
-def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
+def _chosen(recorded: DoubtfulSession | DoubtfulRobot, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and returns the clearly best one with --yes."""
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
+    if isinstance(recorded, DoubtfulRobot):
+        say(f"Robot {recorded.robot}:")
     at = guess.candidates.index(guess.best)
     shown = guess.candidates[: max(_SHOWN, at + 1)]
     left = len(guess.candidates) - len(shown)

@@ -36,9 +36,9 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
-# Options of `convert` that take sessions of one camera and one robot, or change all of them, or not
-# all rows of a robot's stop.
-_OF_ONE = re.compile(r"--(?:guess|shift|by-joints|intrinsics|positions)\b")
+# Options of `convert` that change all robots or cameras.
+_OF_ONE = re.compile(r"--(?:by-joints|intrinsics)\b")
+_BY_HAND = "Of several robots or cameras, correct the files by hand."
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
 # After a calibration's output stands the need that was typed.
@@ -64,7 +64,7 @@ class Remedy:
         """The remedy for several robots or cameras: by hand where its command takes one of each."""
         if not _OF_ONE.search(self.command):
             return self
-        by_hand = "Of several robots or cameras, correct the files by hand."
+        by_hand = _BY_HAND
         if "--intrinsics" in self.command:
             by_hand = 'Of several cameras, write intrinsics = "refine" in the table of this one.'
         return Remedy(f"{self.words} {by_hand}")
@@ -94,6 +94,7 @@ def without(views: Sequence[int], residuals: str) -> str:
     return f"Without {left_out}, the others predict each other to {residuals}."
 
 
+BY_HAND = Remedy(f"Write a copy of the session that is read so, and calibrate it. {_BY_HAND}")
 READ_AGAIN = Remedy(
     "Write a copy of the session that is read so, and calibrate it.", GUESS_AND_CALIBRATE
 )

@@ -113,6 +113,16 @@ class Candidate:
         return "; ".join(self.hypothesis.changes) or "as first read"
 
     @property
+    def is_of_robot(self) -> bool:
+        """Whether it changes how the robot's numbers are read, and nothing else."""
+        found, declared = self.hypothesis, self.recording.declared
+        return (found.camera, found.mount, found.order) == (
+            declared.camera,
+            declared.mount,
+            declared.order,
+        )
+
+    @property
     def log_posterior(self) -> float:
         """Log posterior of the reading, up to a constant of the views."""
         cost = self.hypothesis.cost

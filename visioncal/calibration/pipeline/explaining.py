@@ -2,12 +2,12 @@
 
 from contextlib import suppress
 
-from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
+from visioncal.calibration.pipeline.guess_inputs import closes, guess_from_camera_poses
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.other_board import OtherBoardError
-from visioncal.calibration.suspects.misread_poses import UNRECORDED, closes, with_misreading
+from visioncal.calibration.suspects.misread_poses import UNRECORDED, with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.types import MOUNTS

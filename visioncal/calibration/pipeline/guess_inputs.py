@@ -1,22 +1,29 @@
-"""Input of the search for misread poses: the camera's poses by images, the robot's numbers."""
+"""Input of the search for misread poses: the camera's by images, the robot's numbers, chains."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.guess.fit import Fit, robust_fits
 from visioncal.calibration.guess.readings import SideReading
-from visioncal.calibration.guess.recording import Recording
+from visioncal.calibration.guess.recording import FEWEST_ROWS, Recording
 from visioncal.calibration.guess.search import in_one_turn, turns_alike
 from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.transforms import compose
-from visioncal.core.types import MOUNTS, FloatArray, Mount
+from visioncal.core.types import MOUNTS, FloatArray, IntArray, Mount
+from visioncal.estimation.chain import robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
+from visioncal.session.frames import object_name
+from visioncal.vision.targets import first_numbers
 
 
 def guess_from_camera_poses(
@@ -138,3 +145,66 @@ def _camera_numbers(run: RunState, robot: PoseNumbers) -> PoseNumbers:
 def _places_of(session: Session) -> tuple[str, ...]:
     """Names of a session's rows in messages."""
     return tuple(f"view {view.number}" for view in session.views)
+
+
+def open_pairs(
+    run: RunState, robot: str, base_from_flange: Mapping[int, FloatArray]
+) -> tuple[list[CameraTargetPair], list[CameraTargetPair]]:
+    """The pairs of a camera and a target whose chain does not close through a robot, and others.
+
+    Those of most views first; the robot's (4, 4) poses are given by view.
+    """
+    every = [pair for pair in pairs_of(run, robot) if len(pair.poses) >= FEWEST_ROWS]
+    wrong = [pair for pair in every if not closes(base_from_flange, pair.poses, pair.mount)]
+    return wrong, [pair for pair in every if pair not in wrong]
+
+
+def of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
+    """A cell's run as that of one robot, camera and target alone."""
+    session = run.session.of(pair.camera, robot, pair.target)
+    views = {view.number for view in session.views}
+    first = first_numbers(run.session.boards).get(object_name(pair.target, "target"), 0)
+    cameras = dict[str, CameraObservations]()
+    # Of poses that are given there are no corners.
+    if (look := run.cameras.get(pair.camera)) is not None:
+        # Corners of other targets are no corners of this one, which has numbers of its own.
+        corners = {
+            view: replace(seen, ids=seen.ids - first)
+            for view, seen in look.corners.items()
+            if view in views
+        }
+        cameras[pair.camera] = replace(look, corners=corners)
+    return replace(
+        run,
+        session=session,
+        robots={name: report for name, report in run.robots.items() if name == robot},
+        cameras=cameras,
+        poses=pair.poses,
+    )
+
+
+def closes(
+    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
+) -> bool:
+    """Whether the chain of one robot closes as declared; true with too few views to show it."""
+    fit = chain_fit(base_from_flange, seen, mount)
+    return fit is None or fit.closes
+
+
+def chain_fit(
+    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
+) -> Fit | None:
+    """The robust fit of the chain of one robot; None of too few views."""
+    _, both = both_sides(base_from_flange, seen, mount)
+    if len(both) < FEWEST_ROWS:
+        return None
+    return robust_fits(robot_part(both[:, 0], mount)[None], both[:, 1][None])[0]
+
+
+def both_sides(
+    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
+) -> tuple[IntArray, FloatArray]:
+    """(m,) views, and (m, 2, 4, 4) poses of the robot and of the target by each image alone."""
+    alike = alike_turning(base_from_flange, seen, mount)
+    both = [(base_from_flange[view], pose) for view, pose in alike.items()]
+    return np.array([*alike], dtype=int), np.array(both).reshape(-1, 2, 4, 4)

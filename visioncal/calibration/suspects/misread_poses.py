@@ -1,7 +1,8 @@
 """Findings on misread poses: another reading of them explains what the cameras see."""
 
+import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -10,16 +11,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
-from visioncal.calibration.guess.fit import Fit, is_about_one_axis, robust_fits
+from visioncal.calibration.guess.fit import is_about_one_axis
 from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
-from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
+from visioncal.calibration.pipeline.guess_inputs import (
+    both_sides,
+    chain_fit,
+    closes,
+    guess_from_camera_poses,
+    of_pair,
+    open_pairs,
+)
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import exchanged_columns
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
-from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.other_board import MEND_IMAGES
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.late_poses import by_joints
 from visioncal.calibration.suspects.misread_readings import misread_readings
@@ -31,13 +37,19 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.transforms import exp, invert, log
-from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending, or_alone
-from visioncal.estimation.chain import robot_part
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.verdict import (
+    BY_HAND,
+    CALIBRATE,
+    READ_AGAIN,
+    Finding,
+    Remedy,
+    mending,
+    or_alone,
+)
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
-from visioncal.session.frames import object_name
-from visioncal.vision.targets import first_numbers
+from visioncal.session.kinds import name_of
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -83,6 +95,8 @@ _IN_MOTION = Remedy(
     "Wait until the arm stands still before each image, and log the measured pose then; or record "
     "times of images and of a stream of poses (stamp_s, streams): then the delay is estimated."
 )
+# Views whose poses an option changes.
+_ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):")
 # Shares of the way to another stop that are tried.
 _SHARES = np.linspace(-0.4, 0.4, 81).round(2)
 UNRECORDED = Remedy(
@@ -131,7 +145,7 @@ def with_undone(run: RunState) -> RunState:
         return run
     for robot in run.session.robots:
         for pair in pairs_of(run, robot):
-            mistake = likeliest(_of_pair(run, robot, pair))
+            mistake = likeliest(of_pair(run, robot, pair))
             if mistake is None:
                 continue
             whose = f"Robot {robot}, in its rows of {pair.camera} and {pair.target}"
@@ -140,10 +154,31 @@ def with_undone(run: RunState) -> RunState:
                 # The other views are those of all pairs.
                 others = [at.number for at in run.session.views if at.number not in found.views]
                 do = or_alone(do.words, others)
+            else:
+                do = _of_all_rows(found, run, robot)
             found = replace(found, words=f"{whose}: {found.words}", do=do)
             run = undone(run, replace(mistake, found=found))
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
+
+
+def _of_all_rows(found: Finding, run: RunState, robot: str) -> Remedy | None:
+    """A finding's remedy whose command changes all rows of a robot at the stops of its views.
+
+    Between two rows that are shifted all are, whether or not they are of the same pair.
+    """
+    do, rows = found.do, run.session.views
+    named = None if do is None else _ON_VIEWS.search(do.command)
+    if do is None or named is None:
+        return do
+    of_robot = [at for at in rows if name_of(run.session.declaration, "robot", at) == robot]
+    stops = {at.stop for at in of_robot if at.number in found.views}
+    if named[1] == "shift":
+        ends = [at for at, view in enumerate(of_robot) if view.stop in stops]
+        stops = {at.stop for at in of_robot[ends[0] : ends[-1] + 1]}
+    start, end = named.span(2)
+    every = ranges([at.number for at in of_robot if at.stop in stops])
+    return replace(do, command=f"{do.command[:start]}{every}{do.command[end:]}")
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:
@@ -156,23 +191,22 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         yield from _misread_poses(run) if run.readings is None else misread_readings(run)
         return
     for robot in (name for name in run.session.robots if name in run.robots):
-        poses, every = run.robots[robot].base_from_flange, pairs_of(run, robot)
-        every = [pair for pair in every if len(pair.poses) >= FEWEST_ROWS]
-        wrong = [pair for pair in every if not closes(poses, pair.poses, pair.mount)]
+        wrong, right = open_pairs(run, robot, run.robots[robot].base_from_flange)
         whose = f"robot {robot}" if robot else "the robot"
         for pair in wrong:
             if (other := _on_another(run, robot, pair)) is not None:
                 yield other
                 break
-            hint = next(_misread_poses(_of_pair(run, robot, pair)), None)
+            hint = next(_misread_poses(of_pair(run, robot, pair), of_cell=True), None)
             if hint is None:
                 continue
             within = ""
-            if len(wrong) < len(every):
+            if right:
                 # Through other cameras or targets its poses are right.
                 seen = " and ".join(filter(None, [pair.camera, pair.target]))
                 within = f", in its rows of {seen}"
-            yield replace(hint, words=f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}")
+            words = f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}"
+            yield replace(hint, words=words, do=_of_all_rows(hint, run, robot))
             # All of these would show the same.
             break
 
@@ -180,7 +214,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
 def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:
     """The finding that a camera or a target is on another robot's flange than is declared."""
     stops = {view.number: view.stop for view in run.session.views}
-    declared = _chain_fit(run.robots[robot].base_from_flange, pair.poses, pair.mount)
+    declared = chain_fit(run.robots[robot].base_from_flange, pair.poses, pair.mount)
     for other in (name for name in run.robots if name != robot):
         there = run.robots[other].base_from_flange.items()
         by_stop = {stops[view]: pose for view, pose in there}
@@ -189,7 +223,7 @@ def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | 
         turns = np.array([pose[:3, :3] for pose in poses.values()]).reshape(-1, 3, 3)
         if len(turns) < FEWEST_ROWS or is_about_one_axis(turns):
             continue
-        found = _chain_fit(poses, pair.poses, pair.mount)
+        found = chain_fit(poses, pair.poses, pair.mount)
         if found is not None and declared is not None and found.closes:
             frame = pair.camera if pair.mount == "eye-in-hand" else pair.target
             return Finding(
@@ -206,8 +240,11 @@ def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | 
     return None
 
 
-def _misread_poses(run: RunState) -> Iterator[Finding]:
-    """The finding on the reading of one robot's poses that closes the chain, if any."""
+def _misread_poses(run: RunState, *, of_cell: bool = False) -> Iterator[Finding]:
+    """The finding on the reading of one robot's poses that closes the chain, if any.
+
+    Of a whole cell, a command reads the rows of a robot anew, and none else.
+    """
     try:
         guess = guess_from_camera_poses(run)
     except VisioncalError:
@@ -222,6 +259,8 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
     if guess.stands_out and all(hint.do in (UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
+        if of_cell and not guess.best.is_of_robot:
+            step = BY_HAND
         words = guess.sentence
         if robot.mirrored:
             step = _MIRRORED if run.cameras else replace(_MIRRORED, command="")
@@ -241,7 +280,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are not those of the images, whatever the frames are."""
-    views, both = _both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
+    views, both = both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
     kept, robot = thinned(np.arange(len(both))), both[:, 0]
     views, both = views[kept], both[kept]
     if len(both) < FEWEST_ROWS:
@@ -386,62 +425,11 @@ def turned_boards(run: RunState) -> Iterator[Finding]:
             )
 
 
-def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
-    """A cell's run as that of one robot, camera and target alone."""
-    session = run.session.of(pair.camera, robot, pair.target)
-    views = {view.number for view in session.views}
-    first = first_numbers(run.session.boards).get(object_name(pair.target, "target"), 0)
-    cameras = dict[str, CameraObservations]()
-    # Of poses that are given there are no corners.
-    if (look := run.cameras.get(pair.camera)) is not None:
-        # Corners of other targets are no corners of this one, which has numbers of its own.
-        corners = {
-            view: replace(seen, ids=seen.ids - first)
-            for view, seen in look.corners.items()
-            if view in views
-        }
-        cameras[pair.camera] = replace(look, corners=corners)
-    return replace(
-        run,
-        session=session,
-        robots={robot: run.robots[robot]},
-        cameras=cameras,
-        poses=pair.poses,
-    )
-
-
-def closes(
-    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
-) -> bool:
-    """Whether the chain of one robot closes as declared; true with too few views to show it."""
-    fit = _chain_fit(base_from_flange, seen, mount)
-    return fit is None or fit.closes
-
-
-def _chain_fit(
-    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
-) -> Fit | None:
-    """The robust fit of the chain of one robot; None of too few views."""
-    _, both = _both_sides(base_from_flange, seen, mount)
-    if len(both) < FEWEST_ROWS:
-        return None
-    return robust_fits(robot_part(both[:, 0], mount)[None], both[:, 1][None])[0]
-
-
-def _both_sides(
-    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
-) -> tuple[IntArray, FloatArray]:
-    """(m,) views, and (m, 2, 4, 4) poses of the robot and of the target by each image alone."""
-    alike = alike_turning(base_from_flange, seen, mount)
-    both = [(base_from_flange[view], pose) for view, pose in alike.items()]
-    return np.array([*alike], dtype=int), np.array(both).reshape(-1, 2, 4, 4)
-
-
 # Findings measured through the robot, which mean nothing where its poses are misread.
 BY_CHAIN = (
     *(*STEPS, ARM_ERRORS, "prior"),
     *("board_size", "board_shape", "lens", "lens_field", "corner_noise", "tool_frame"),
-    *("carried_away", "tool_active", "late_poses"),
+    *("carried_away", "tool_active", "late_poses", "untied"),
 )
 MISREAD_POSES, MISREAD_READINGS = (
     Suspect(kind, None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)

@@ -19,6 +19,7 @@ from visioncal.interchange.formats.registry import (
     write_session,
 )
 from visioncal.interchange.formats.rereading import (
+    DoubtfulRobot,
     DoubtfulSession,
     load_for_rereading,
     reread,

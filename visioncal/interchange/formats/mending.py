@@ -1,6 +1,7 @@
 """Mends rows of a session: images of other rows, boards that were read turned, positions."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,7 @@ from visioncal.session.columns import (
     pose_row,
 )
 from visioncal.session.kinds import declared_targets, name_of
+from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.camera import turned_back
 from visioncal.vision.targets import corner_positions
 
@@ -111,25 +113,30 @@ def _chosen_views(session: Session, views: Sequence[int], option: str) -> list[i
 def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
     """Gives some views the robot's columns of so many rows later, or earlier where negative.
 
-    Views whose row there is none, or another view's that stays, are dropped, and `corrected` names
-    them. Raises DataError, also for a whole cell: rows next to each other are of other robots.
+    Of a whole cell, these are rows of one robot, and are counted by its stops. Views whose row
+    there is none, or another view's that stays, are dropped, and `corrected` names them. Raises
+    DataError.
     """
-    if len(session.robots) > 1 or len(session.cameras) > 1:
-        raise DataError(
-            f"Session {session.name!r} has several robots or cameras: rows next to each other are "
-            "not of one of them, and cannot be shifted together.",
-            culprits=["--shift"],
-            next_step="In views.csv, move the pose columns of that robot by hand.",
-        )
     moved, rows = set(_chosen_views(session, views, "--shift")), session.views
-    places = {at for at, view in enumerate(rows) if view.number in moved}
-    kept = {*_OBSERVED, *_MUST_AGREE, "view", "role"}
+    kept, of_robot = {*_OBSERVED, *_MUST_AGREE, "view", "role"}, [*range(len(rows))]
+    stops = [(-1, at) for at in of_robot]
+    if is_whole_cell(session):
+        of_robot, kept = _rows_of_one_robot(session, moved), {*kept, "stop", "robot"}
+        # A row without a number of its stop is a stop of its own.
+        stops = [(-1, at) if view.stop is None else (view.stop, -1) for at, view in enumerate(rows)]
+    order = [*dict.fromkeys(stops[at] for at in of_robot)]
+    first = {stops[at]: at for at in reversed(of_robot)}
+    changed = {stops[at] for at in of_robot if rows[at].number in moved}
     cells, dropped = list[dict[str, str]](), list[int]()
     for at, view in enumerate(rows):
-        source = at + by if at in places else at
-        if at in places and source not in places:
-            dropped.append(view.number)
-            continue
+        source = at
+        if view.number in moved:
+            place = order.index(stops[at]) + by
+            stop = order[place] if 0 <= place < len(order) else None
+            if stop not in changed:
+                dropped.append(view.number)
+                continue
+            source = first[stop]
         cells.append(
             {name: (view if name in kept else rows[source]).cell(name) for name in session.columns}
         )
@@ -139,6 +146,24 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
     if corners is not None:
         corners = corners.of_views([view.number for view in rows if view.number not in dropped])
     return _with_cells(session, cells, note, corners=corners)
+
+
+def _rows_of_one_robot(session: Session, views: AbstractSet[int]) -> list[int]:
+    """The places of all rows of the robot that some views of a whole cell are of.
+
+    Raises:
+        DataError: They are of several robots.
+    """
+    names = [name_of(session.declaration, "robot", view) for view in session.views]
+    robots = {name for name, view in zip(names, session.views, strict=True) if view.number in views}
+    if len(robots) > 1 or "" in robots:
+        raise DataError(
+            f"Views {ranges(views)} of session {session.name!r} are not all of one robot: the rows "
+            f"of {some_of(sorted(filter(None, robots))) or 'no robot'} cannot be shifted together.",
+            culprits=["--shift"],
+            next_step="Name the views of one robot's rows (column robot of views.csv).",
+        )
+    return [at for at, name in enumerate(names) if name in robots]
 
 
 def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -> Session:

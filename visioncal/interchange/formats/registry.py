@@ -14,6 +14,7 @@ from visioncal.core.choices import MOUNTS
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.number_format import known_name
+from visioncal.core.types import Progress
 from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.bags import BAG
 from visioncal.interchange.formats.columns import TABLE, VIEWS
@@ -32,12 +33,19 @@ from visioncal.interchange.formats.mending import (
 )
 from visioncal.interchange.formats.metrology import METROLOGY
 from visioncal.interchange.formats.pose_forms import check_radians
-from visioncal.interchange.formats.rereading import DoubtfulSession, load_for_rereading, reread
+from visioncal.interchange.formats.rereading import (
+    DoubtfulRobot,
+    DoubtfulSession,
+    doubtful_robots,
+    load_for_rereading,
+    reread,
+    reread_robot,
+)
 from visioncal.interchange.formats.settling import settled
 from visioncal.interchange.formats.sources import describe, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID
 from visioncal.session import Session
-from visioncal.session.selecting import check_one_of_each
+from visioncal.session.selecting import is_whole_cell
 
 # The first that recognises a path reads it, so that of anything comes last; `views` must be asked
 # for, as it reads the same.
@@ -59,7 +67,7 @@ _DEFAULTS = ImportOptions()
 _FREE_LENSES = replace(_DEFAULTS, intrinsics="estimate")
 
 # Tries other readings of the poses, and selects one.
-Choose: TypeAlias = Callable[[DoubtfulSession], Candidate]
+Choose: TypeAlias = Callable[[DoubtfulSession | DoubtfulRobot], Candidate]
 
 
 @typed
@@ -146,9 +154,8 @@ def convert(
         session = Session.load(source)
     else:
         doubtful = load_for_rereading(source)
-        check_one_of_each(doubtful.session)
     if choose is not None:
-        session = reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
+        session = _reread(doubtful, choose, requested.progress, mirrors_poses=mirrors_poses)
     mends: tuple[tuple[Callable[..., Session], tuple[object, ...] | None], ...] = (
         (exchange_views, exchange),
         (shift_views, shift),
@@ -168,6 +175,17 @@ def convert(
         session = mend_images(session, requested.progress)
     write_session(session, dest)
     return session
+
+
+def _reread(
+    doubtful: DoubtfulSession, choose: Choose, progress: Progress | None, *, mirrors_poses: bool
+) -> Session:
+    """The session in the chosen reading, of a whole cell robot by robot; raises DataError."""
+    if not is_whole_cell(doubtful.session):
+        return reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
+    for of_robot in doubtful_robots(doubtful, progress):
+        doubtful = reread_robot(doubtful, of_robot, choose(of_robot))
+    return doubtful.session
 
 
 def _checked(

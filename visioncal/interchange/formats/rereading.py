@@ -1,6 +1,6 @@
 """Finds another reading of a recording's poses, and applies it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -16,6 +16,8 @@ from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
     numbers_in,
+    of_pair,
+    open_pairs,
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
@@ -44,6 +46,7 @@ from visioncal.session.columns import (
     POSE,
     joint_columns,
 )
+from visioncal.session.kinds import name_of
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
 
@@ -89,6 +92,21 @@ class DoubtfulSession:
         """
         run = measured_run(self.session, progress)
         return guess_from_camera_poses(run, self.robot, self.camera, knows_mount=self.knows_mount)
+
+
+@dataclass(frozen=True, eq=False)
+class DoubtfulRobot:
+    """A robot of a whole cell whose poses may be in another convention."""
+
+    robot: str
+    run: RunState  # Run of the robot with one camera and one target alone.
+    views: frozenset[int]  # Those whose poses may be.
+    numbers: PoseNumbers | None  # The robot's poses as they are written; None for the session's.
+
+    def guess(self, progress: Progress | None = None) -> Guess:
+        """Tries every plausible reading of its poses; raises as `DoubtfulSession.guess`."""
+        del progress
+        return guess_from_camera_poses(self.run, self.numbers)
 
 
 def measured_run(session: Session, progress: Progress | None) -> RunState:
@@ -234,13 +252,7 @@ def reread(
             next_step="Turn the images back, and find their corners anew; only where the robot's "
             "frame is left-handed, mirror its poses with --mirror-poses.",
         )
-    if candidate.hypothesis.robot.has_lost_turns:
-        raise DataError(
-            "Nothing was written: angles in degrees that were taken for radians lost whole turns, "
-            "and those about the last axis of the tool cannot be found again.",
-            culprits=[candidate.words],
-            next_step="Convert the robot's own log, or make the poses anew from angles in radians.",
-        )
+    _refuse_lost(candidate)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     camera = doubtful.camera or numbers_in(session, MEASURED_CAM_POSE)
     robot = doubtful.robot or numbers_in(session, POSE)
@@ -287,9 +299,86 @@ def reread(
     return replace(reread, warnings=tuple(notes))
 
 
-def _robot_table(doubtful: DoubtfulSession, candidate: Candidate) -> dict[str, Any]:
+def doubtful_robots(
+    doubtful: DoubtfulSession, progress: Progress | None = None
+) -> Iterator[DoubtfulRobot]:
+    """The robots of a whole cell whose chains do not close; raises as `DoubtfulSession.guess`.
+
+    Each is tested with the camera and the target of most of its views.
+    """
+    session = doubtful.session
+    run = measured_run(session, progress)
+    poses = {view.number: view.base_from_flange() for view in session.views}
+    known = {number: pose.as_matrix() for number, pose in poses.items() if pose is not None}
+    for robot in session.robots:
+        wrong, right = open_pairs(run, robot, known)
+        if not wrong:
+            continue
+        sound = {view for pair in right for view in pair.poses}
+        of_robot = [
+            at
+            for at, view in enumerate(session.views)
+            if name_of(session.declaration, "robot", view) == robot and view.number not in sound
+        ]
+        part = of_pair(run, robot, wrong[0])
+        numbers, rows = doubtful.robot, {view.number: at for at, view in enumerate(session.views)}
+        if numbers is not None:
+            numbers = numbers.rows(np.array([rows[view.number] for view in part.session.views]))
+        views = frozenset(session.views[at].number for at in of_robot)
+        yield DoubtfulRobot(robot, part, views, numbers)
+
+
+def reread_robot(
+    doubtful: DoubtfulSession, of_robot: DoubtfulRobot, candidate: Candidate
+) -> DoubtfulSession:
+    """Applies a reading to the poses of one robot of a whole cell; noted in `corrected`.
+
+    Raises:
+        DataError: The reading changes more than this robot's poses.
+    """
+    session, robot = doubtful.session, of_robot.robot
+    _refuse_lost(candidate)
+    if candidate.hypothesis.robot.mirrored or not candidate.is_of_robot:
+        raise DataError(
+            f"Robot {robot}: the chain closes with {candidate.words}, which changes more than the "
+            "poses of this robot: nothing was written.",
+            culprits=[candidate.words],
+            next_step="Of several robots or cameras, correct the files by hand.",
+        )
+    numbers = doubtful.robot or numbers_in(session, POSE)
+    rows = [at for at, view in enumerate(session.views) if view.number in of_robot.views]
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    corrected = candidate.hypothesis.robot.corrected(numbers.rows(np.array(rows)))
+    _replace_cells([cells[at] for at in rows], pose_cells(corrected, POSE), POSE)
+    document, words = {**session.document}, candidate.words
+    if table := _robot_table(doubtful, candidate, robot).get("robot"):
+        document["robots"] = {**document["robots"], robot: table}
+    change = f"Poses of robot {robot} are read otherwise than at first: {words}."
+    changed = session.with_content(
+        document=noting(session, document, [change]),
+        cells=[[row[name] for name in session.columns] for row in cells],
+    )
+    read = replace(changed, warnings=tuple(dict.fromkeys((change, *session.warnings))))
+    return replace(doubtful, session=read)
+
+
+def _refuse_lost(candidate: Candidate) -> None:
+    """Refuses a reading whose rotations cannot be had back; raises DataError."""
+    if candidate.hypothesis.robot.has_lost_turns:
+        raise DataError(
+            "Nothing was written: angles in degrees that were taken for radians lost whole turns, "
+            "and those about the last axis of the tool cannot be found again.",
+            culprits=[candidate.words],
+            next_step="Convert the robot's own log, or make the poses anew from angles in radians.",
+        )
+
+
+def _robot_table(
+    doubtful: DoubtfulSession, candidate: Candidate, robot: str = ""
+) -> dict[str, Any]:
     """`[robot]` with the maker by the columns' names, without one whose rotations are others."""
-    stated = doubtful.session.document.get("robot")
+    document = doubtful.session.document
+    stated = document.get("robots", {}).get(robot) if robot else document.get("robot")
     table = stated or {}
     found, declared = candidate.hypothesis.robot, candidate.recording.declared.robot
     if (found.rotation, found.written) != (declared.rotation, declared.written):
