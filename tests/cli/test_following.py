@@ -261,8 +261,8 @@ def calibrate(path: str) -> tuple[str, ...]:
     return "calibrate", path, "-o", "out"
 
 
-FOCAL, CELL = "    914.2,\n    913.6,", calibrate("cell")
-MATRIX = f"matrix = [\n{FOCAL}\n    645.3,\n    396.8,\n]"
+FOCAL, CELL = "    457.1,\n    456.8,", calibrate("cell")
+MATRIX = f"matrix = [\n{FOCAL}\n    322.65,\n    198.4,\n]"
 CONVERT = ("convert", "log.csv", "new", "--images", "cell/images", "--mount", "eye-in-hand")
 CONVERT += ("--target", "charuco_9x6_30mm")
 # What somebody did wrong, the command, and how it ends: with that status and those words.
@@ -311,13 +311,14 @@ DONE_WRONG = {
     "tabs": (text(",", "\t", "views.csv"), CELL, 0, "good"),
     "another board": (text("charuco_9x6_30mm", "charuco_7x5_36mm"), CELL, 0, "good"),
     "cv2's matrix": (
-        text(MATRIX, "matrix = [[914.2, 0, 645.3], [0, 913.6, 396.8], [0, 0, 1]]"), CELL, 0, "good",
+        text(MATRIX, "matrix = [[457.1, 0, 322.65], [0, 456.8, 198.4], [0, 0, 1]]"),
+        CELL, 0, "good",
     ),
-    "a comma in the matrix": (text("914.2", "914,2"), CELL, 2, "must be [fx, fy, cx, cy] [px]"),
+    "a comma in the matrix": (text("457.1", "457,1"), CELL, 2, "must be [fx, fy, cx, cy] [px]"),
     "a focal length in mm": (text(FOCAL, "3.6, 3.6,"), CELL, 2, "fx and fy are in pixels"),
-    "a lens of twice the size": (text(FOCAL, "1828.4, 1827.2,"), CELL, 0, "good"),
+    "a lens of twice the size": (text(FOCAL, "914.2, 913.6,"), CELL, 0, "good"),
     "images squeezed to another width": (
-        lambda it: (resized(of_few_views(it), 1, (1066, 800)), text("1280", "1066")(it)),
+        lambda it: (resized(of_few_views(it), 1, (533, 400)), text("640", "533")(it)),
         CELL, 0, "good",
     ),
     "[cam] for [camera]": (text("[camera]", "[cam]"), CELL, 0, "good"),
@@ -359,7 +360,7 @@ QUICK = (
 )
 def test_a_user_s_mistake_ends_in_a_result_or_in_a_message(place, name):
     plant, words, status, said = DONE_WRONG[name]
-    plant(sound_session(place / "cell"))
+    plant(sound_session(place / "cell", SMALL))
     followed = follow(*words)
     assert followed.last.status == status, followed.last.said
     assert said in followed.last.said
