@@ -11,6 +11,7 @@ from visioncal.calibration.stages import detect, other_board
 from visioncal.core.types import Corners
 from visioncal.verification import scene_audit
 from visioncal.vision.boards.identify import identify
+from visioncal.vision.boards.layout import decoded
 from visioncal.vision.scene import register
 
 
@@ -40,7 +41,8 @@ SEARCHES = [
     (detect, "corners_in", corners_in),
     (other_board, "identify", _identify),
     (mended_images, "identify", _identify),
-    # The package offers a function of the module's name.
+    # Packages offer functions of the modules' names.
     (import_module("visioncal.interchange.formats.assemble"), "identify", _identify),
+    (import_module("visioncal.vision.boards.identify"), "decoded", _once(decoded)),
     (scene_audit, "register", _once(register)),
 ]
