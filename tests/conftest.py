@@ -79,6 +79,18 @@ def rendered(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def files_are_written_later():
+    """Leaves it to the system when files are on the disk, as no test cuts the power.
+
+    Waiting for the disk takes a tenth of the time of tests that write many files.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        # Of a file that is open.
+        patch.setattr(os, "fsync", os.fstat)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def calibrations_are_as_their_schema_says(tmp_path_factory):
     """Checks the files that tests wrote, when the last of them has run."""
     yield
