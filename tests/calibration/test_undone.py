@@ -135,6 +135,13 @@ def corners_of(mount, distortion=None):
     return robot if mount == "eye-in-hand" else invert(robot), seen
 
 
+@cache
+def calibrated_corners():
+    """The result of these corners in a hand."""
+    robot, seen = corners_of(MOUNTS[0])
+    return visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+
+
 def split(pose):
     return cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
 
@@ -548,7 +555,7 @@ def test_corners_of_smaller_pictures_are_scaled_by_the_printed_command(
 ):
     monkeypatch.chdir(tmp_path)
     robot, seen = corners_of(MOUNTS[0])
-    sound = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    sound = calibrated_corners()
     seen = scaled_at(some, share, seen)
     Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]).save(tmp_path / "cell")
     cause, mended = followed("cell")
@@ -699,7 +706,8 @@ def test_exchanged_columns_of_corners_are_exchanged_back_by_the_printed_command(
         # All would be in the picture, too; the lens's centre is not in its middle.
         inside = [(px > 0).all(axis=1) & (px < SIZE[1]).all(axis=1) for _, px in seen]
         seen = [(ids[at], px[at]) for (ids, px), at in zip(seen, inside, strict=True)]
-    sound = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    session = Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0])
+    sound = calibrated_corners() if beyond else visioncal.calibrate(session)
     seen = [(ids, px[:, ::-1]) for ids, px in seen]
     Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]).save(tmp_path / "cell")
     found = follow("calibrate", "cell", "-o", "out")
@@ -978,9 +986,15 @@ def test_a_small_marker_with_the_other_pose_is_named(tmp_path, monkeypatch):
     assert np.linalg.norm(away) < 0.01
 
 
+@cache
+def whole_cell(seed):
+    """The session of a whole cell without a mistake."""
+    return recorded(simulate(replace(OPTIONS, seed=seed, stops=24)))
+
+
 def in_a_cell(seed, kind):
     """A whole cell whose robot b has one mistake from a stop on, and the views that are wrong."""
-    session = recorded(simulate(replace(OPTIONS, seed=seed, stops=24)))
+    session = whole_cell(seed)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     of_b = [at for at, view in enumerate(session.views) if view.text.get("robot") == "b"]
     stops = sorted({session.views[at].stop for at in of_b})
@@ -1064,7 +1078,7 @@ def test_corners_of_other_boards_are_no_corners_of_a_pair_of_a_cell():
 
 @pytest.mark.slow
 def test_a_cell_gets_no_command_that_would_drop_the_lenses_of_all_its_cameras():
-    session = recorded(simulate(replace(OPTIONS, seed=0, stops=24)))
+    session = whole_cell(0)
     left = session.document["cameras"]["left"]
     other = {**left, "matrix": [1.3 * left["matrix"][0], *left["matrix"][1:]]}
     cameras = {**session.document["cameras"], "left": other}
