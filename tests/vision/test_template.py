@@ -129,7 +129,7 @@ def test_circles_of_another_diameter_are_as_exact_and_no_blur(square_px):
 
 @pytest.mark.parametrize("stated", [0.85, *map(slow, (1.0, 1.15))])
 def test_blurred_circles_are_blurred_whatever_their_stated_diameter(stated):
-    image, _ = photograph(CIRCLES, replace(SMALL, square_px=60), 1)
+    image, _ = photograph(CIRCLES, replace(SMALL, square_px=45), 1)
     blurred = cv2.GaussianBlur(image, (0, 0), 6.0)
     # A motion of 21 px has the standard deviation of a uniform distribution, in one direction.
     smeared = cv2.filter2D(image, -1, np.full((1, 21), 1 / 21, np.float32))

@@ -291,7 +291,7 @@ BROKEN: Mapping[str, Mistake] = {
             _toml("1280,\n    800", "960,\n    600")(folder),
         )[0],
         # The images and the board.
-        "two images missing": _deleted,
+        "two images missing": Mistake(_deleted, SMALL.options),
         "images named .jpg": _as_jpg,
         "images in another folder": lambda folder: (folder / "images").rename(folder / "frames"),
         "another kind of board": _board(kind="checkerboard", columns=8, rows=5),
