@@ -150,7 +150,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     if foreign.lenses:
         document["cameras"] = {name: dict(lens) for name, lens in foreign.lenses.items()}
     elif images or foreign.corners:
-        document["camera"] = _camera(foreign, store, images)
+        document["camera"] = _of_size(_camera(foreign, store, images), store, images, notes)
     elif (foreign.lens or {}).get("model") == "points":
         document["camera"] = {"model": "points"}
     target = foreign.target if images or foreign.corners else None
@@ -405,6 +405,37 @@ def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) 
                 next_step="Give --resolution WIDTH,HEIGHT.",
             )
     return lens
+
+
+# Images whose size is compared with that of the intrinsics.
+_SIZED = 3
+
+
+def _of_size(
+    lens: dict[str, Any], store: ImageStore, paths: Sequence[str], notes: list[str]
+) -> dict[str, Any]:
+    """A lens of images of this size, where the stated one is of larger or smaller ones, and a note.
+
+    Images of another shape are part of others: those keep the lens as it is, and are refused later.
+    """
+    there = [path for path in paths if store.exists(path)] if "matrix" in lens else []
+    sizes = {image_size(store.read(path)) for path in there[:_SIZED]} - {None}
+    stated = tuple(lens.get("resolution", ()))
+    if len(sizes) != 1 or stated in sizes or not stated:
+        return lens
+    size = next(filter(None, sizes))
+    share = np.array(size) / np.array(stated)
+    # A side may be rounded to whole pixels.
+    if abs(share[0] * stated[1] - size[1]) > 1.0:
+        return lens
+    fx, fy, cx, cy = (float(value) for value in lens["matrix"])
+    scaled = [fx * share[0], fy * share[1], *((np.array([cx, cy]) + 0.5) * share - 0.5)]
+    notes.append(
+        f"The intrinsics are of images of {stated[0]} x {stated[1]} pixels, and these have "
+        f"{size[0]} x {size[1]}: the matrix is scaled by {share[0]:.4g}. Where these are a part "
+        "of those, --intrinsics estimate leaves it out."
+    )
+    return lens | {"matrix": [float(value) for value in scaled], "resolution": list(size)}
 
 
 def _robot(foreign: ForeignRecording, document: dict[str, Any]) -> dict[str, Any] | None:

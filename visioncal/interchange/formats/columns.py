@@ -10,6 +10,7 @@ from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.apart import several_recordings, tables_apart
 from visioncal.interchange.formats.fields import (
     Fields,
     corners_in,
@@ -44,15 +45,16 @@ from visioncal.interchange.formats.sources import (
     Source,
     describe,
     proposed,
-    several_recordings,
-    tables_apart,
     unknown,
 )
 from visioncal.interchange.formats.unread import (
+    armless_note,
     check_pictures,
     check_points,
+    of_most_images,
     points_beside,
     series_note,
+    small_part,
 )
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
@@ -89,6 +91,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
                 target, of_board = board if foreign.images else (None, ())
                 beside = [each for _, each, _ in readings if each is not fields]
                 all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(asked, requested))
+                all_notes += (*armless_note(foreign),)
                 all_notes += series_note(fields, beside)
                 lens_of = foreign.lens or lens
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
@@ -97,7 +100,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             faults.append(error)
     if not found:
         raise faults[0]
-    (rank, first), *others = sorted(found, key=lambda each: each[0])
+    (rank, first), *others = sorted(of_most_images(found), key=lambda each: each[0])
+    first = replace(first, notes=(*small_part(first, source, instead), *first.notes))
     is_clear = not others or others[0][0] > rank
     if apart := _files_apart(first, source, readings[0][2], readings[0][1]):
         robot, camera = apart

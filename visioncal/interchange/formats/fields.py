@@ -19,7 +19,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M, FEWEST_VIEWS
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.interchange.formats.keys import HOW, Keys, in_seconds, matched
+from visioncal.interchange.formats.keys import HOW, Keys, Match, in_seconds, matched
 
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
 _NORM_TOLERANCE = 0.01
@@ -353,7 +353,7 @@ def joined(
         is_alone = True
         for cluster in clusters:
             main = cluster[0][0]
-            match = matched(main.keys, part.keys) if main.form == part.form else None
+            match = _match(main, part)
             # Rows that name images may do so for several others.
             if match is not None and (is_alone or match.how != HOW[-1]):
                 cluster.append((part, match.rows))
@@ -366,6 +366,18 @@ def joined(
         cluster[0][0] if len(cluster) == 1 else _merged(cluster, name, folder, prefixed=prefixed)
         for cluster in clusters
     ]
+
+
+def _match(main: Fields, part: Fields) -> Match | None:
+    """How rows of one source belong to those of another; None where they are not the same rows.
+
+    Numbers in columns of other names, as those of four cameras beside the counts of forty rows,
+    are the same by chance unless most rows have them.
+    """
+    match = matched(main.keys, part.keys) if main.form == part.form else None
+    if match is None or match.how != HOW[1] or match.is_same:
+        return match
+    return match if 2 * int((match.rows >= 0).sum()) > max(len(main), len(part)) else None
 
 
 def _by_category(fields: Fields) -> list[Fields]:

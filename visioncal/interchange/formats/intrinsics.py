@@ -81,10 +81,16 @@ LENS_KEYS = (*_MATRIX_KEYS, *_DISTORTION_KEYS)
 _FOURS = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"))
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _SIZE_KEYS = (("imagewidth", "imageheight"), ("width", "height"), ("w", "h"))
+# Sizes (width, height) in one list or mapping.
+_BOTH_SIDES = ("resolution", "image_size", "image_size_wh", "img_size", "image_resolution")
+# Key of the words why a lens beside other content is not read.
+FAULT = "fault"
+# Lists of coefficients in a mapping of the distortion.
+_LISTED_KEYS = ("coefficients", "coeffs", "values", "data")
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
 _BROWN = (
     *("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none"),
-    "brown_conrady",
+    *("brown_conrady", "opencv", "opencv_standard"),
 )
 
 
@@ -138,7 +144,10 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
 
 
 def lenses_in(document: object, where: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """All intrinsics in a document, at any depth, with where they stand."""
+    """All intrinsics in a document, at any depth, with where they stand.
+
+    Of a lens that cannot be read as a whole there is its `FAULT` alone.
+    """
     if not isinstance(document, Mapping):
         return
     written = _plain(document)
@@ -147,8 +156,39 @@ def lenses_in(document: object, where: str) -> Iterator[tuple[str, dict[str, Any
         with suppress(DataError):
             yield where, intrinsics_from(document, where)[0]
             return
+    if (outer := _outer(document)) is not None:
+        # Coefficients and the size of the image stand beside the matrix.
+        try:
+            yield f"{where}: {outer}", intrinsics_from(document, where)[0]
+        except DataError as error:
+            yield f"{where}: {outer}", {FAULT: error.message}
+        return
     for name, value in document.items():
         yield from lenses_in(value, f"{where}: {name}")
+
+
+def _outer(document: Mapping[str, Any]) -> str | None:
+    """The key of the only mapping that names all four numbers of a matrix; None of others."""
+    found = [
+        name
+        for name, value in document.items()
+        if isinstance(value, Mapping) and any(_plain(value).keys() >= {*names} for names in _FOURS)
+    ]
+    return found[0] if len(found) == 1 else None
+
+
+def _around(content: Mapping[str, Any], outer: str, where: str) -> dict[str, Any]:
+    """Content of a lens and beside it: of single numbers those alone that are sides around it."""
+    inner = content[outer]
+    _, _, *centre = _four(inner, where) or []
+    beside = {name: value for name, value in content.items() if name != outer}
+    sides = {name for names in _SIZE_KEYS for name in names}
+    for plain, name in _plain(beside).items():
+        value = beside[name]
+        is_side = plain in sides and number(value, f"{where}: {name}") > max(centre)
+        if not (is_side or isinstance(value, Mapping | list | str | np.ndarray)):
+            del beside[name]
+    return {**beside, **inner}
 
 
 def intrinsics_from(
@@ -159,11 +199,13 @@ def intrinsics_from(
         where = f"{where}: cam0"
         content = mapping(content["cam0"], where)
     key = _named(content, _MATRIX_KEYS)
-    for outer in (_named(content, ("intrinsics", "CameraIntrinsics")), key):
-        inner = content.get(outer or "")
+    for of in (_named(content, ("intrinsics", "CameraIntrinsics")), key):
+        inner = content.get(of or "")
         if isinstance(inner, Mapping) and "data" not in inner:
-            rest = {name: value for name, value in content.items() if name != outer}
-            return intrinsics_from({**rest, **inner}, f"{where}: {outer}")
+            rest = {name: value for name, value in content.items() if name != of}
+            return intrinsics_from({**rest, **inner}, f"{where}: {of}")
+    if key is None and _four(content, where) is None and (outer := _outer(content)) is not None:
+        return intrinsics_from(_around(content, outer, where), f"{where}: {outer}")
     matrix = _four(content, where)
     if matrix is None and key is not None:
         k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
@@ -199,6 +241,9 @@ def _coefficients(content: Mapping[str, Any], where: str) -> list[float]:
         last = _COEFFICIENTS.index(known[-1]) + 1
         names = [written.get(name, "") for name in _COEFFICIENTS[:last]]
         return [number(found[name], f"{where}: {name}") if name else 0.0 for name in names]
+    if key is not None and isinstance(found, Mapping):
+        listed = _named(found, _LISTED_KEYS)
+        key, found = (key, found) if listed is None else (f"{key}: {listed}", found[listed])
     return [] if key is None else _array(found, f"{where}: {key}").reshape(-1).tolist()
 
 
@@ -256,7 +301,9 @@ def _visp(root: Element, where: str) -> dict[str, Any]:
 def _lens(
     matrix: list[float], coefficients: list[float], content: Mapping[str, Any], where: str
 ) -> dict[str, Any]:
-    name = str(content.get("distortion_model", "none")).lower()
+    inner = content.get(_named(content, _DISTORTION_KEYS) or "")
+    of_inner = inner.get("model", "none") if isinstance(inner, Mapping) else "none"
+    name = str(content.get("distortion_model", of_inner)).lower()
     # As RealSense says it; another `model` is that of the camera.
     stated = str(content.get("model", "")).lower().rpartition(".")[2]
     if name == "none" and stated.endswith("brown_conrady") and any(coefficients):
@@ -289,10 +336,12 @@ def _size(content: Mapping[str, Any], where: str) -> tuple[int, int] | None:
             sides = [number(content[written[name]], f"{where}: {name}") for name in names]
             break
     else:
-        if "resolution" not in written:
+        key = _named(content, _BOTH_SIDES)
+        if key is None:
             return None
-        stated = content[written["resolution"]]
-        sides = list(as_numbers(stated, f"{where}: resolution").reshape(-1))
+        if isinstance(content[key], Mapping):
+            return _size(content[key], f"{where}: {key}")
+        sides = list(as_numbers(content[key], f"{where}: {key}").reshape(-1))
     if len(sides) != 2 or not all(side % 1 == 0 and 0 < side < 1e6 for side in sides):
         raise DataError(f"{where}: the size of the image is {sides}.", culprits=[where])
     return int(sides[0]), int(sides[1])

@@ -107,6 +107,7 @@ class Match:
 
     how: str  # A name among `HOW`.
     rows: IntArray  # (n,) the other's row of each; -1 for none.
+    is_same: bool = True  # Whether the keys stand in columns of one name.
 
 
 HOW = ("equal names", "their numbers", "their times", "their order")
@@ -127,7 +128,7 @@ def matched(first: Keys, second: Keys) -> Match | None:
             if fits and (common, is_equal, is_same) > best[0]:
                 best = (common, is_equal, is_same), rows
         if len(best[1]):
-            return Match(how, best[1])
+            return Match(how, best[1], best[0][2])
     return Match(HOW[3], np.arange(first.count)) if first.count == second.count else None
 
 

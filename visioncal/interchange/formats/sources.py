@@ -8,7 +8,6 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from visioncal.interchange.formats.fields import (
 from visioncal.interchange.formats.file_search import FileGroup, groups_in, head
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import (
+    FAULT,
     LENS_KEYS,
     lenses_in,
     read_target_description,
@@ -38,14 +38,12 @@ from visioncal.interchange.formats.intrinsics import (
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.keys import HOW
 from visioncal.interchange.formats.poses import (
-    PoseFields,
     column_groups,
     columns_named,
     pose_names,
     possible_poses,
     ranked_poses,
     without_copies,
-    words_of,
 )
 from visioncal.interchange.formats.reading import DOCUMENTS, read_record, read_rows
 from visioncal.robot import Robot
@@ -65,7 +63,6 @@ _SHUT = dict.fromkeys((".pkl", ".pickle", ".p"), _PICKLE) | dict.fromkeys(
 _CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
 # Readings of one source that are tested, and names of rows that are a robot's.
 _MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
-_OF_ROBOT = re.compile("robot|arm|gripper|flange|tcp|hand", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +97,11 @@ class Source:
 
     def lens(self) -> tuple[Mapping[str, Any] | None, tuple[str, ...]]:
         """The only lens, or the colour camera's, and its origin; None without a lens."""
-        found = {place: lens for part in self.parts for place, lens in part.lenses.items()}
+        every = {place: lens for part in self.parts for place, lens in part.lenses.items()}
+        found = {place: lens for place, lens in every.items() if FAULT not in lens}
+        if every and not found:
+            words = "; ".join(str(lens[FAULT]).rstrip(".") for lens in every.values())
+            return None, (f"The intrinsics are left aside: {words}; --intrinsics names a file.",)
         named = {p: lens for p, lens in found.items() if "rgb" in p.lower() or "colo" in p.lower()}
         different = {str(lens): place for place, lens in (named or found).items()}
         if len(different) == 1:
@@ -132,7 +133,10 @@ class Source:
             lines.append(f"  {part.group.listed()}: {_kind(part)}")
             for fields in part.rows:
                 lines += [f"    {line}" for line in _field_lines(fields)]
-            lines += [f"    {place}: looks like a lens" for place in part.lenses]
+            lines += [
+                f"    {place}: {lens.get(FAULT, 'looks like a lens')}"
+                for place, lens in part.lenses.items()
+            ]
         rest = [part.group.label for part in others if part not in listed]
         lines = lines[:60]
         if rest:
@@ -205,11 +209,11 @@ def _one_by_one(part: Part, source: Path, form: str | None) -> list[Part]:
         return [part]
     groups = (FileGroup(file.relative_to(source).as_posix(), (file,)) for file in files)
     each = [replace(_part(group, form), kin=part.group.label) for group in groups]
-    are_whole = all(any(map(_is_whole, one.rows)) for one in each)
+    are_whole = all(any(map(is_whole, one.rows)) for one in each)
     return each if are_whole else [part]
 
 
-def _is_whole(fields: Fields) -> bool:
+def is_whole(fields: Fields) -> bool:
     """Whether rows are enough, and their fields are such, that they may be a recording's."""
     return len(fields) >= FEWEST_ROWS and bool(possible_poses(fields))
 
@@ -396,93 +400,6 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
     )
 
 
-def several_recordings(source: Source, requested: ImportOptions) -> DataError | None:
-    """The error of a folder with several files that are each a whole recording; None of others.
-
-    Each has the same fields, with poses of both sides, or their names differ in numbers alone:
-    rows of one are none of another's.
-    """
-    alike: dict[tuple[str, ...], list[tuple[Path, int]]] = {}
-    for part in source.parts:
-        for fields in part.rows if len(part.group.files) == 1 else ():
-            poses = [item for item in possible_poses(fields) if item.is_named]
-            # An instrument's poses or points beside joint angles.
-            is_of_joints = not source.images and bool(joint_names(fields, ()))
-            is_of_joints &= bool(poses or columns_named(fields, ("x", "y", "z")))
-            both = len(poses) > 1 or is_of_joints
-            if _is_whole(fields) if part.kin else both:
-                own = alike.setdefault(
-                    (part.kin,) if part.kin else tuple(sorted(fields.numbers)), []
-                )
-                own.append((part.group.files[0], len(fields)))
-    found = max(alike.values(), key=len, default=[])
-    if len(found) < 2:
-        return None
-    first = max(found, key=lambda each: each[1])[0]
-    command = [str(first) if word == str(source.path) else word for word in requested.command]
-    files = [f"{file.name} ({counted(count, 'row')})" for file, count in found]
-    return DataError(
-        f"{source.path} has {len(found)} files that are each a recording: {some_of(files)}.",
-        culprits=[str(file) for file, _ in found],
-        next_step="Convert one of them"
-        + (f":\n{shlex.join(command)}" if requested.command else "."),
-    )
-
-
-def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] | None:
-    """The robot's file and the camera's where two files of poses are as long; None of others.
-
-    The names of the files say which side each is of. Raises DataError where they do not.
-    """
-    files = [
-        (part.group.files[0], fields)
-        for part in source.parts
-        for fields in part.rows
-        if len(part.group.files) == 1 and possible_poses(fields) and "joint" not in part.group.name
-    ]
-    sides = {file: _sides(file) for file, _ in files}
-    files.sort(key=lambda of: (sides[of[0]] == ["camera"], not _OF_ROBOT.search(of[0].stem)))
-    # Two files of one side, as of a camera's poses before and after a filter, are no pair.
-    pairs = [
-        (a, b, fields, others)
-        for (a, fields), (b, others) in combinations(files, 2)
-        if len(fields) == len(others) and sides[a] != ["camera"] and sides[b] != ["robot"]
-    ]
-    if len(pairs) != 1 or (len(files) > 2 and len(pairs[0][2]) < FEWEST_ROWS):
-        return None
-    robot, camera, fields, others = pairs[0]
-    if sides[robot] == ["robot"] and sides[camera] == ["camera"]:
-        return robot, camera
-    command = [str(robot) if word == str(source.path) else word for word in requested.command]
-    both = shlex.join([*command, "--camera-file", str(camera)])
-    if _is_run_again(fields, others):
-        raise DataError(
-            f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}, "
-            "as of two runs of one side: then nothing says what a camera saw.",
-            culprits=[str(camera)],
-            next_step=f"Name one, with --images; or both, where their frames are alike:\n{both}",
-        )
-    raise DataError(
-        f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
-        "which are the robot's is not stated.",
-        culprits=[str(robot), str(camera)],
-        next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n{both}",
-    )
-
-
-def _is_run_again(fields: Fields, others: Fields) -> bool:
-    """Whether rows are of another run of one motion: they differ by under 5 % of what they span."""
-    one, other = (np.hstack([*map(each.column, each.numbers)]) for each in (fields, others))
-    if one.shape != other.shape:
-        return False
-    return bool(np.nanmedian(np.abs(one - other)) < 0.05 * np.nanstd(one, axis=0).max())
-
-
-def _sides(file: Path) -> list[str]:
-    """The sides whose frames the words of a file's name are: `robotData`, `cam_poses_2`."""
-    return PoseFields((), tuple(words_of(re.sub(r"[0-9]+", "_", file.stem)))).sides
-
-
 def rows_in(source: Source) -> list[Fields]:
     """Rows of the parts, those joined that belong together; those of poses where there are any."""
     found = joined(
@@ -497,4 +414,11 @@ def rows_in(source: Source) -> list[Fields]:
         prefixed=True,
     )
     named = [replace(f, name=source.path.resolve().name) if f.stems else f for f in found]
-    return [fields for fields in named if possible_poses(fields)] or named
+    # Joint angles of as many rows or more say where the arm stood, too, where there are pictures.
+    most = max((len(fields) for fields in named if possible_poses(fields)), default=0)
+    return [
+        fields
+        for fields in named
+        if possible_poses(fields)
+        or (source.images and len(fields) >= most and joint_names(fields, ()))
+    ] or named

@@ -2,8 +2,8 @@
 
 import json
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from glob import escape
 from itertools import combinations
 from pathlib import Path
@@ -18,8 +18,8 @@ from visioncal.core.procrustes import align, spreads
 from visioncal.core.transforms import apply, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields, unit_by_size, without_unit
-from visioncal.interchange.formats.file_search import DRAWN
-from visioncal.interchange.formats.foreign import ImportOptions
+from visioncal.interchange.formats.file_search import DRAWN, FileGroup
+from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions
 from visioncal.interchange.formats.poses import PoseFields, points_in, possible_poses
 from visioncal.interchange.formats.sources import Source, rows_in
 
@@ -99,6 +99,57 @@ def series_note(fields: Fields, others: Sequence[Fields]) -> tuple[str, ...]:
         return ()
     note = f"Of several series {own} is read; left aside: {some_of([*alike.values()])}, for files"
     return (f"{note} of their own.",)
+
+
+def of_most_images(
+    found: Sequence[tuple[int, ForeignRecording]],
+) -> list[tuple[int, ForeignRecording]]:
+    """The readings without those of few of the images, as of frames beside rows of them all."""
+    used = [len({*foreign.images} - {None}) for _, foreign in found]
+    kept, left = list[tuple[int, ForeignRecording]](), dict[str, int]()
+    for item, count in zip(found, used, strict=True):
+        if 2 * count >= max(used):
+            kept.append(item)
+        else:
+            left[item[1].robot.places[0]] = len(item[1].robot)
+    if not left:
+        return kept
+    rows = some_of([f"{place} ({counted(count, 'row')})" for place, count in left.items()])
+    note = f"Left aside, as {max(used)} images have other rows: {rows} and on."
+    return [(rank, replace(each, notes=(*each.notes, note))) for rank, each in kept]
+
+
+def small_part(
+    first: ForeignRecording, source: Source, instead: Sequence[FileGroup] | None
+) -> Iterator[str]:
+    """A note on a recording of less than half of the images of a kind, with what else there is."""
+    used = {*first.images} - {None}
+    groups = source.images if instead is None else instead
+    kinds = [group for group in groups if used & {*group.files}]
+    count = sum(len(group.files) for group in kinds)
+    if not used or 2 * len(used) >= count:
+        return
+    longer = [
+        f"{part.group.files[0].name} ({counted(len(fields), 'row')})"
+        for part in source.parts
+        for fields in part.rows
+        if len(fields) > len(first.robot) and len(part.group.files) == 1
+    ]
+    others = f"; rows of other files are more: {some_of(longer)}" if longer else ""
+    yield (
+        f"ATTENTION: only {len(used)} of {count} images are views, as {first.name} has "
+        f"{counted(len(first.robot), 'row')} of the robot{others}."
+    )
+
+
+def armless_note(foreign: ForeignRecording) -> Iterator[str]:
+    """A note on joint angles of an arm that nobody names."""
+    is_armless = foreign.arm is None and foreign.robot_document is None
+    if is_armless and foreign.joints_rad is not None and not foreign.robot.present.any():
+        yield (
+            "There are joint angles and no poses of the robot: calibrate needs the arm, as by "
+            "--robot-model with a built-in robot, its .urdf or a DH table."
+        )
 
 
 def _series(fields: Fields) -> tuple[str, set[str]]:
