@@ -84,11 +84,17 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
     command = [str(robot) if word == str(source.path) else word for word in requested.command]
     both = shlex.join([*command, "--camera-file", str(camera)])
     if _is_run_again(fields, others):
+        # Of the very same rows both sides would be one.
+        is_copy = all(
+            name in others.numbers and np.array_equal(numbers, others.numbers[name], equal_nan=True)
+            for name, numbers in fields.numbers.items()
+        )
+        again = "." if is_copy else f"; or both, where their frames are alike:\n{both}"
         raise DataError(
             f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}, "
             "as of two runs of one side: then nothing says what a camera saw.",
             culprits=[str(camera)],
-            next_step=f"Name one, with --images; or both, where their frames are alike:\n{both}",
+            next_step=f"Name one, with --images{again}",
         )
     raise DataError(
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
@@ -98,12 +104,26 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
     )
 
 
+# Most that two runs of one motion differ by, as a share of what a column spans: a joint repeats to
+# less than a degree, and a hand to a centimetre of some hundreds of millimetres.
+_SAME_RUN = 0.05
+
+
 def _is_run_again(fields: Fields, others: Fields) -> bool:
-    """Whether rows are of another run of one motion: they differ by under 5 % of what they span."""
+    """Whether rows are of another run of one motion: most columns differ by little of their span.
+
+    Lengths and rotations have sizes of their own: where positions span hundreds of millimetres, any
+    two rotations are near each other beside these.
+    """
     one, other = (np.hstack([*map(each.column, each.numbers)]) for each in (fields, others))
     if one.shape != other.shape:
         return False
-    return bool(np.nanmedian(np.abs(one - other)) < 0.05 * np.nanstd(one, axis=0).max())
+    spans = np.nanstd(one, axis=0)
+    varied = spans > 1e-9 * np.nanmax(np.abs(one), initial=0.0)
+    if not varied.any():
+        return True
+    shares = np.nanmedian(np.abs(one - other), axis=0)[varied] / spans[varied]
+    return bool(np.median(shares) < _SAME_RUN)
 
 
 def _sides(file: Path) -> list[str]:

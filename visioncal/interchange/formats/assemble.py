@@ -135,7 +135,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.title or foreign.name}
     document |= {} if mount == "instrument" else {"mount": mount}
-    document |= {"instrument": dict(foreign.instrument)} if foreign.instrument else {}
+    document |= _instrument(foreign, mount)
     notes = list(foreign.notes)
     store = foreign.store
     if store is None:
@@ -407,6 +407,13 @@ def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) 
     return lens
 
 
+def _instrument(foreign: ForeignRecording, mount: Mount) -> dict[str, Any]:
+    """`[instrument]`, which also without a sigma says that what was read is an instrument's."""
+    if mount != "instrument" and not foreign.instrument:
+        return {}
+    return {"instrument": {"name": "instrument"} | dict(foreign.instrument or {})}
+
+
 # Images whose size is compared with that of the intrinsics.
 _SIZED = 3
 
@@ -419,7 +426,10 @@ def _of_size(
     Images of another shape are part of others: those keep the lens as it is, and are refused later.
     """
     there = [path for path in paths if store.exists(path)] if "matrix" in lens else []
-    sizes = {image_size(store.read(path)) for path in there[:_SIZED]} - {None}
+    sizes = set[tuple[int, int] | None]()
+    # Pictures that cannot be read are refused later, with what else is wrong.
+    with suppress(DataError):
+        sizes = {image_size(store.read(path)) for path in there[:_SIZED]} - {None}
     stated = tuple(lens.get("resolution", ()))
     if len(sizes) != 1 or stated in sizes or not stated:
         return lens

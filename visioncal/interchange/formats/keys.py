@@ -107,7 +107,7 @@ class Match:
 
     how: str  # A name among `HOW`.
     rows: IntArray  # (n,) the other's row of each; -1 for none.
-    is_same: bool = True  # Whether the keys stand in columns of one name.
+    is_sure: bool = True  # Whether the keys are no small numbers in columns of different names.
 
 
 HOW = ("equal names", "their numbers", "their times", "their order")
@@ -117,7 +117,11 @@ def matched(first: Keys, second: Keys) -> Match | None:
     """Matches rows by equal names, else numbers, else times, else by their order; None if none."""
     fewest = min(first.count, second.count)
     for how in HOW[:3]:
-        best: tuple[tuple[int, bool, bool], IntArray] = ((1, False, False), np.zeros(0, int))
+        best: tuple[tuple[int, bool, bool], IntArray, bool] = (
+            (1, False, False),
+            np.zeros(0, int),
+            False,
+        )
         for (a, keys), (b, their) in product(first.found[how].items(), second.found[how].items()):
             is_time = how == HOW[2]
             rows, is_equal = (_nearest(keys, their), True) if is_time else _equal(keys, their)
@@ -126,9 +130,9 @@ def matched(first: Keys, second: Keys) -> Match | None:
             is_sure = is_same or how != HOW[1] or any(len(str(key)) > 4 for key in their)
             fits = common == fewest or (2 * common > fewest and is_sure)
             if fits and (common, is_equal, is_same) > best[0]:
-                best = (common, is_equal, is_same), rows
+                best = (common, is_equal, is_same), rows, is_sure
         if len(best[1]):
-            return Match(how, best[1], best[0][2])
+            return Match(how, *best[1:])
     return Match(HOW[3], np.arange(first.count)) if first.count == second.count else None
 
 

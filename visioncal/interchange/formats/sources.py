@@ -27,7 +27,7 @@ from visioncal.interchange.formats.fields import (
     joined,
     named_by,
 )
-from visioncal.interchange.formats.file_search import FileGroup, groups_in, head
+from visioncal.interchange.formats.file_search import DRAWN, FileGroup, groups_in, head
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import (
     FAULT,
@@ -385,8 +385,10 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         others.sort(key=lambda item: counts.get(item.names[0].partition(".")[0], 0) > len(fields))
         for whose, item in zip(("robot", "camera"), (robot, *others[:1]), strict=False):
             options += [f"--{whose}-{named_by(fields.places[0])}", ",".join(item.names)]
-        step = f"Say {' '.join(options)}, where these are its poses"
-        step += f":\n{shlex.join([*requested.command, *options])}" if requested.command else "."
+        step = _of_one_file(source, requested, robot.names)
+        if not step:
+            step = f"Say {' '.join(options)}, where these are its poses"
+            step += f":\n{shlex.join([*requested.command, *options])}" if requested.command else "."
     elif rows:
         word = named_by(rows[0].places[0])
         step = f"Name them with --robot-{word}, or the joint angles with --joint-{word}."
@@ -398,6 +400,43 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         or "Write the poses into a CSV with a header, one row per view. Lists in a .py or .cpp "
         "program are read where it is named as the source.",
     )
+
+
+def _of_one_file(source: Source, requested: ImportOptions, names: Sequence[str]) -> str:
+    """Next step where several files have the same columns: the file of as many rows as pictures.
+
+    Empty where these columns are those of one file.
+    """
+    files = {
+        part.group.files[0]: len(fields)
+        for part in source.parts
+        for fields in part.rows
+        if len(part.group.files) == 1 and {*names} <= {*fields.numbers}
+    }
+    if len(files) < 2:
+        return ""
+    groups = [group for group in source.images if not DRAWN.search(group.label)]
+    fits = [
+        (file, group)
+        for group in sorted(groups, key=lambda each: each.is_depth)
+        for file, count in files.items()
+        if count == len(group.files)
+    ]
+    longest = max(files, key=lambda file: files[file])
+    file, images = fits[0] if fits else (longest, None)
+    listed = some_of([f"{each.name} ({counted(count, 'row')})" for each, count in files.items()])
+    step = f"{len(files)} files have the columns {','.join(names)}: {listed}. Name the one that is "
+    step += "the recording"
+    options = list[str]()
+    if images is not None:
+        alone = [group for group in groups if group.files[0].parent == images.files[0].parent]
+        pictures = images.files[0] if len(alone) > 1 else images.files[0].parent
+        step += f", as {file.name}, of as many rows as there are images in {images.label}"
+        options = [] if requested.images else ["--images", str(pictures)]
+    if not requested.command:
+        return f"{step}."
+    words = [str(file) if word == str(source.path) else word for word in requested.command]
+    return f"{step}:\n{shlex.join([*words, *options])}"
 
 
 def rows_in(source: Source) -> list[Fields]:
