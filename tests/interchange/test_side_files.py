@@ -6,10 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
+from support.following import follow
 
 from visioncal.interchange.formats.intrinsics import FAULT, lenses_in, read_intrinsics
+from visioncal.interchange.formats.joints import joint_names
+from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 
 BOARD = ("--target", "checkerboard_9x7_20mm", "--mount", "eye-to-hand")
@@ -126,3 +130,182 @@ def test_a_lens_that_is_not_read_is_named(tmp_path):
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", *BOARD).good()
     assert "The intrinsics are left aside: lens.json: intrinsics_K: the lens model" in done.err
     assert Session.load(tmp_path / "out").camera is None
+
+
+def test_files_of_the_same_columns_are_named_and_the_one_of_the_pictures_is_read(
+    tmp_path, monkeypatch
+):
+    """A command that adds columns which all of them have would be a circle."""
+    monkeypatch.chdir(tmp_path)
+    shoot(tmp_path / "in/lens", "RGB{}.png", 14)
+    shoot(tmp_path / "in/saved", "{}.png", 9)
+    for count, name in ((9, "set"), (11, "set (copy)"), (12, "set for later")):
+        poses = matrices(count, count)
+        turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+        np.savetxt(tmp_path / f"in/{name}.txt", np.hstack([1e3 * poses[:, :3, 3], turns]))
+    said = ("--target", "checkerboard_9x7_20mm", "--mount", "eye-to-hand")
+    said = (*said, "--robot-form", "rotation-vector", "--robot-unit", "mm")
+    followed = follow("convert", "in", "out", *said)
+    first = followed.runs[0].refused().err
+    assert "3 files have the columns 1,2,3,4,5,6: set (copy).txt (11 rows), set" in first
+    assert "as set.txt, of as many rows as there are images in saved/#.png" in first
+    followed.last.good()
+    assert len(followed.done) == 1
+    assert len(Session.load("out").views) == 9
+
+
+def written(folder: Path, robot: np.ndarray, camera: np.ndarray) -> Path:
+    folder.mkdir(parents=True)
+    for name, poses in (("one.txt", robot), ("other.txt", camera)):
+        np.savetxt(folder / name, poses.reshape(len(poses) * 4, 4))
+    return folder
+
+
+def test_two_sides_are_no_two_runs_of_one(tmp_path):
+    """Lengths in millimetres make all rotations near each other beside these."""
+    robot, tool, base = matrices(12, 1), *matrices(2, 2)
+    robot[:, :3, 3] *= 1e3
+    tool[:3, 3] *= 30
+    base[:3, 3] *= 400
+    pair = written(tmp_path / "pair", robot, np.linalg.inv(base) @ robot @ tool)
+    said = visioncal("convert", pair, tmp_path / "out", "--mount", "eye-to-hand").refused().err
+    assert "has 12 poses in one.txt and as many in other.txt: which are the robot's" in said
+    assert "nearly the same" not in said
+    again = robot.copy()
+    again[:, :3, 3] += np.random.default_rng(3).normal(0, 2, (12, 3))
+    runs = written(tmp_path / "runs", robot, again)
+    said = visioncal("convert", runs, tmp_path / "out", "--mount", "eye-to-hand").refused().err
+    assert "nearly the same 12 rows" in said
+    assert "--camera-file" in said
+    # The very same rows are no second side.
+    copies = written(tmp_path / "copies", robot, robot)
+    said = visioncal("convert", copies, tmp_path / "out", "--mount", "eye-to-hand").refused().err
+    assert "nearly the same 12 rows" in said
+    assert "--camera-file" not in said
+
+
+def tracked(folder: Path, points: int, seed=4) -> tuple[np.ndarray, np.ndarray]:
+    """Joint angles [deg] (n, 6) and places [mm] (n, k, 3) of points that are fast on a flange."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    joints, on_flange = rng.uniform(-90, 90, (10, 6)), rng.uniform(-90, 90, (points, 3))
+    poses = matrices(10, seed)
+    places = 1e3 * poses[:, None, :3, 3] + np.einsum("nij,kj->nki", poses[:, :3, :3], on_flange)
+    return joints, 900.0 + places
+
+
+def test_an_instrument_needs_no_name(tmp_path):
+    joints, places = tracked(tmp_path / "in", 1)
+    np.savetxt(tmp_path / "in/joints.txt", joints)
+    np.savetxt(tmp_path / "in/places.txt", places[:, 0])
+    said = ("--mount", "instrument", "--robot-model", "irb120")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    assert "The sigma of the readings is not stated" in done.err
+    assert len(Session.load(tmp_path / "out").views) == 10
+
+
+TRACKED = ("--instrument", "0.02", "--robot-model", "irb120")
+
+
+def test_points_of_several_files_are_read_together_and_others_are_named(tmp_path):
+    joints, places = tracked(tmp_path / "in", 3)
+    np.savetxt(tmp_path / "in/joints_tool.txt", joints)
+    for at in range(3):
+        np.savetxt(tmp_path / f"in/position_SMR_{at + 1}.txt", places[:, at])
+    np.savetxt(tmp_path / "in/position_SMR_base.txt", places[:3, 0] + 300)
+    # A drawing of one of them is no further point.
+    rng = np.random.default_rng(2)
+    np.savetxt(tmp_path / "in/position_nominal.txt", places[:, 0] + rng.normal(0, 1, (10, 3)))
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *TRACKED).good()
+    session = Session.load(tmp_path / "out")
+    assert len(session.views) == 30
+    named = [f"position_SMR_{at}" for at in (1, 2, 3)]
+    assert [view.point for view in session.views[::10]] == named
+    assert [view.stop for view in session.views] == [*range(10)] * 3
+    found = [[view.numbers[f"meas_{axis}_m"] for axis in "xyz"] for view in session.views]
+    np.testing.assert_allclose(found, 1e-3 * np.swapaxes(places, 0, 1).reshape(-1, 3))
+    assert "Left aside: position_SMR_base.txt (3 rows), position_nominal.txt (10" in done.err or (
+        "position_SMR_base.txt (3 rows)" in done.err and "position_nominal.txt (10" in done.err
+    )
+
+
+@pytest.mark.parametrize("by_point", [False, True])
+@pytest.mark.parametrize("ending", ["mat", "txt"])
+def test_several_points_a_stop_without_names_are_told_by_their_distances(
+    tmp_path, by_point, ending
+):
+    joints, places = tracked(tmp_path / "in", 3)
+    rows = (np.swapaxes(places, 0, 1) if by_point else places).reshape(-1, 3)
+    if ending == "mat":
+        savemat(tmp_path / "in/CaliJointAngles.mat", {"CaliJointAngles": joints})
+        savemat(tmp_path / "in/CaliPosition.mat", {"CaliPosition": rows})
+    else:
+        np.savetxt(tmp_path / "in/CaliJointAngles.txt", joints)
+        np.savetxt(tmp_path / "in/CaliPosition.txt", rows)
+    said = TRACKED if ending == "mat" else (*TRACKED, "--joint-columns", "1,2,3,4,5,6")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    order = "one after the other" if by_point else "in turn at each stop"
+    assert f"3 points are taken {order}" in done.err
+    session = Session.load(tmp_path / "out")
+    assert len(session.views) == 30
+    for view, row in zip(session.views, rows, strict=True):
+        assert view.numbers["meas_y_m"] == pytest.approx(1e-3 * row[1])
+        np.testing.assert_allclose(view.joints_rad, np.deg2rad(joints[view.stop]))
+
+
+def test_points_whose_order_their_distances_do_not_show_are_refused(tmp_path):
+    joints, places = tracked(tmp_path / "in", 2)
+    np.savetxt(tmp_path / "in/joints.txt", joints)
+    rows = np.random.default_rng(1).permutation(places.reshape(-1, 3))
+    np.savetxt(tmp_path / "in/places.txt", rows)
+    said = visioncal("convert", tmp_path / "in", tmp_path / "out", *TRACKED).refused().err
+    assert "Add a column `stop`" in said
+
+
+def test_positions_and_rotations_in_a_file_each_are_poses(tmp_path):
+    poses, other = matrices(12, 1), matrices(12, 2)
+    (tmp_path / "in").mkdir()
+    for name, of in (("tcp", poses), ("ur", other)):
+        np.savetxt(tmp_path / f"in/pos_{name}", of[:, :3, 3])
+        turns = Rotation.from_matrix(of[:, :3, :3]).as_rotvec()
+        np.savetxt(tmp_path / f"in/rotvec_{name}", turns)
+    places = poses[:, :3, 3] + 0.1 * poses[:, :3, 2] + 1.0
+    np.savetxt(tmp_path / "in/pos_pen", places)
+    said = ("--instrument", "0.5", "--robot-form", "ur")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    views = Session.load(tmp_path / "out").views
+    found = [view.base_from_flange().as_matrix() for view in views]
+    np.testing.assert_allclose(found, poses, atol=1e-12)
+    assert views[3].numbers["meas_z_m"] == pytest.approx(places[3, 2])
+    assert "left aside: pos_ur, rotvec_ur" in done.err
+    said = (*said, "--robot-key", "pos_ur,rotvec_ur", "--camera-key", "pos_pen")
+    visioncal("convert", tmp_path / "in", tmp_path / "ur", *said).good()
+    views = Session.load(tmp_path / "ur").views
+    found = [view.base_from_flange().as_matrix() for view in views]
+    np.testing.assert_allclose(found, other, atol=1e-12)
+
+
+@pytest.mark.parametrize("names", [("法蘭座標", "關節角度"), ("法兰坐标", "关节角")])
+def test_joint_angles_in_chinese_are_no_camera_s(tmp_path, names):
+    poses = matrices(6)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz", degrees=True)
+    both = np.hstack([1e3 * poses[:, :3, 3], turns]).tolist()
+    joints = np.random.default_rng(1).uniform(-150, 150, (6, 6)).tolist()
+    rows = [dict(zip(names, row, strict=True)) for row in zip(both, joints, strict=True)]
+    write(tmp_path / "in/record.json", rows)
+    said = ("--mount", "eye-in-hand", "--robot-form", "euler-xyz-deg")
+    said = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).refused().err
+    assert "has 6 poses of the robot, but neither images nor poses of the target" in said
+    assert f"--camera-key {names[1]}" not in said
+
+
+def test_seven_angle_positions_are_joints(tmp_path):
+    fields = read_fields(
+        _saved(tmp_path / "arm.mat", {"calibrationAnglePositions": np.ones((9, 7)) * 0.3})
+    )
+    assert joint_names(fields, ()) == ("calibrationAnglePositions",)
+
+
+def _saved(path: Path, arrays) -> Path:
+    savemat(path, arrays)
+    return path

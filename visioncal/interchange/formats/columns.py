@@ -91,7 +91,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
                 target, of_board = board if foreign.images else (None, ())
                 beside = [each for _, each, _ in readings if each is not fields]
                 all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(asked, requested))
-                all_notes += (*armless_note(foreign),)
+                all_notes += (*armless_note(foreign, asked),)
                 all_notes += series_note(fields, beside)
                 lens_of = foreign.lens or lens
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)

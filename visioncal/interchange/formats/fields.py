@@ -371,11 +371,11 @@ def joined(
 def _match(main: Fields, part: Fields) -> Match | None:
     """How rows of one source belong to those of another; None where they are not the same rows.
 
-    Numbers in columns of other names, as those of four cameras beside the counts of forty rows,
-    are the same by chance unless most rows have them.
+    Small numbers in columns of other names, as those of four cameras beside the counts of forty
+    rows, are the same by chance unless most rows have them.
     """
     match = matched(main.keys, part.keys) if main.form == part.form else None
-    if match is None or match.how != HOW[1] or match.is_same:
+    if match is None or match.how != HOW[1] or match.is_sure:
         return match
     return match if 2 * int((match.rows >= 0).sum()) > max(len(main), len(part)) else None
 

@@ -19,6 +19,11 @@ _JOINT_NAME = re.compile(
     r"((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
+# Words of joint angles within longer names, and the numbers of joints that arms have.
+_JOINT_WORDS = re.compile(
+    r"joint\w*angle|angle\w*joint|angle_?positions?|gelenkwinkel|achswinkel|关节|關節"
+)
+_OF_ARMS = range(5, 9)
 # Three angles may be a rotation.
 _ANGLES = re.compile(r"(?:.*[._])?angles")
 # Universal Robots' names, which ROS writes in the order of the alphabet.
@@ -49,6 +54,7 @@ def joint_names(
         and name not in taken
         and (
             _JOINTS.fullmatch(plain[name])
+            or (numbers[0].size in _OF_ARMS and _is_of_joints(plain[name]))
             or (numbers[0].size > 4 and _ANGLES.fullmatch(plain[name]))
         )
     ]
@@ -68,6 +74,12 @@ def joint_names(
         ):
             return tuple(by_number.values())
     return ()
+
+
+def _is_of_joints(plain: str) -> bool:
+    """Whether a longer name, in small letters, has the words of joint angles."""
+    last = plain.rpartition(".")[2]
+    return bool(_JOINT_WORDS.search(last)) and not _NO_ANGLE.search(last)
 
 
 def _joints_called(fields: Fields, taken: Collection[str], known: Sequence[str]) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure, known_name, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.assemble import pose_cells
+from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.file_search import files_in, groups_in, head
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -33,6 +34,12 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.joints import joints_from
 from visioncal.interchange.formats.keys import HOW, Keys, matched
+from visioncal.interchange.formats.point_files import (
+    in_turn,
+    parts_of_poses,
+    split_states,
+    together,
+)
 from visioncal.interchange.formats.point_tables import (
     CENTRE,
     FORCE,
@@ -47,6 +54,7 @@ from visioncal.interchange.formats.point_tables import (
 )
 from visioncal.interchange.formats.pose_forms import poses_from
 from visioncal.interchange.formats.reading import ENDINGS, read_rows
+from visioncal.interchange.formats.unread import armless_note
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 from visioncal.session.kinds import known_instruments
 
@@ -66,17 +74,22 @@ _OF_AN_AXIS = {"xl80": "XL-80 reads a length", "xr20": "XR20-W reads the angle o
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a table of points with the robot's state, or two tables; raises DataError."""
     files = [file for group in groups_in(path) if group.is_data for file in group.files]
-    tables = list[PointTable]()
+    tables, every = list[PointTable](), list[Fields]()
     for file in [*files, *filter(None, [requested.camera_file])]:
         with suppress(DataError) if path.is_dir() else nullcontext():
             rows = read_rows(file, requested.robot.form)
             tables += [PointTable.of(fields, file, requested) for fields in rows]
+            every += rows
     given = {*requested.camera.names}
     of_points = [t for t in tables if t.points() or (given and given <= {*t.fields.numbers})]
+    of_points = [t for t in of_points if given == {t.fields.name}] or of_points
     # Poses beside joint angles are of what was measured.
-    states = [t for t in tables if t.joints] or [t for t in tables if t.poses]
-    alone = [table for table in of_points if table not in states]
+    split, states = split_states(every, requested), [t for t in tables if t.joints]
+    states = states or [*(t for t in tables if t.poses), *split]
+    parts = parts_of_poses(every) if split else set[str]()
+    alone = [t for t in of_points if t not in states and t.fields.name not in parts]
     points = next(iter(alone or sorted(of_points, key=lambda table: not table.is_measured)), None)
+    states.sort(key=lambda t: points is None or len(t.fields) != len(points.fields))
     state = next((t for t in states if (t is points) != bool(alone)), None)
     if points is None or (state is points and points.poses and not points.is_measured):
         listed = "; ".join(table.fields.listing() for table in tables)
@@ -96,7 +109,11 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             "--robot-form; or put a table of them, with a column of the targets' or groups' names, "
             f"beside {points.file} in one folder, and convert that.",
         )
-    return _recording(points if state is points else replace(points, poses=()), state, requested)
+    if state is points:
+        return _recording(points, state, requested)
+    points, notes = together(alone, len(state.fields)) if alone and not given else (points, ())
+    foreign = _recording(replace(points, poses=()), state, requested)
+    return replace(foreign, notes=(*foreign.notes, *notes, *armless_note(foreign, requested)))
 
 
 def _recording(points: PointTable, state: PointTable, requested: ImportOptions) -> ForeignRecording:
@@ -106,7 +123,11 @@ def _recording(points: PointTable, state: PointTable, requested: ImportOptions) 
     loads, at = _loads(points), np.arange(len(fields))
     own = (*points.joints, *points.poses) if state is points else ()
     stops, spots = _stops(points, loads, own)
+    if state is not points and (turns := in_turn(points, len(robot))):
+        stops, spots, how = turns
+        notes += (how,)
     if state is not points:
+        notes += robot.notes
         at, how = _paired(points, stops, state)
         notes += (f"Points and the robot's states are paired by {how}.",)
         loads = {k: tuple(v[row] for row in at) for k, v in _loads(state).items()} | loads
@@ -150,7 +171,8 @@ def _places(
     """Cells of readings by row, of places or of a probe's poses, and notes; raises DataError."""
     fields, given = points.fields, requested.camera
     words, names = next(iter(points.points().items()), (word_set(""), ()))
-    names = tuple(map(fields.find, given.names)) or names
+    if given.names != (fields.name,) or fields.name in fields.numbers:
+        names = tuple(map(fields.find, given.names)) or names
     unit, notes = points.unit(names[:3], given.unit)
     angles = {w - TURNS: n for w, n in points.triples().items() if w & TURNS}
     turns = angles.get(words) or (next(iter(angles.values())) if len(angles) == 1 else ())
@@ -159,7 +181,7 @@ def _places(
         turns = tuple(lower[name] for name in quaternion) if {*quaternion} <= {*lower} else turns
     if len(names) == 3 and {*turns} & {*points.poses, *points.joints}:
         turns = ()
-    if len(names) + len(turns) == 3:
+    if sum(fields.column(name).shape[1] for name in names) + len(turns) == 3:
         places = UNITS_M[unit] * np.hstack([fields.column(name) for name in names])
         cells = (
             dict(zip(INSTRUMENT_POSITION, map(repr, at), strict=True)) for at in places.tolist()

@@ -140,6 +140,11 @@ class PointTable:
 
 def _with_headings(fields: Fields) -> Fields:
     """Rows of names, x, y, z and uncertainties without headings, with these."""
+    lists = [numbers for numbers in fields.numbers.values() if numbers.ndim == 2]
+    if len(fields.numbers) == 1 and lists and lists[0].shape[1] == 3:
+        # An array of a file of arrays, which keeps its name.
+        axes = {axis: lists[0][:, at] for at, axis in enumerate("xyz")}
+        return replace(fields, numbers={**fields.numbers, **axes})
     columns = [*fields.texts]
     names = [name for name in columns if name not in fields.numbers]
     if not names and len(columns) in (4, 7) and not (fields.column(columns[0]) % 1).any():

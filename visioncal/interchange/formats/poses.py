@@ -40,15 +40,15 @@ _FRAMES = {
     "robot": (
         _set("base world root basis sockel welt 基座"),
         _set("gripper flange ee tcp tool hand tip flansch greifer werkzeug brida pinza")
-        | _set("herramienta bride outil 法兰 末端"),
+        | _set("herramienta bride outil 法兰 法蘭 末端"),
     ),
     "camera": (
-        _set("cam camera eye sensor kamera cámara camara caméra 相机 vicon optitrack mocap"),
-        _set("target board marker tag object tafel brett tablero mire 标定板"),
+        _set("cam camera eye sensor kamera cámara camara caméra 相机 相機 vicon optitrack mocap"),
+        _set("target board marker tag object tafel brett tablero mire 标定板 標定板"),
     ),
 }
 _SIDE_WORDS = {
-    "robot": _set("robot arm effector eef endeffector manipulator"),
+    "robot": _set("robot arm effector eef endeffector manipulator 机器人 機器人 机械臂 機械臂"),
     "camera": _set("charuco aruco chessboard checkerboard apriltag pattern cft"),
 }
 # Systems that measure the robot's pose, or the camera's where another side is named the robot's.
@@ -63,7 +63,7 @@ _CHILD_FIRST = {"2", "to", "in", "wrt"}
 # How many numbers a pose has, or its position or its rotation.
 _OF_POSES = (16, 12, 9, 7, 6, 4, 3)
 _NO_POSE = re.compile(
-    r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|accel|effort|corner|intrins"
+    r"joint|关节|關節|axis|axes|angles|wrench|speed|force|torque|twist|vel|accel|effort|corner|intrins"
 )
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
 _AXIS_FIRST = re.compile(r"(?<![^ .])([wxyz]|[prt][xyz]|q[wxyz])_([a-z]+)$", re.IGNORECASE)
@@ -82,9 +82,16 @@ _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
 )
 
 
+# Words of a script without spaces: flange, end, base, camera, board, robot, position, coordinates.
+_UNSPACED = re.compile(
+    "(法[兰蘭]|末端|基座|相[机機]|[标標]定板|[机機]器人|[机機]械臂|位置|位姿|[坐座][标標])"
+)
+
+
 def words_of(name: str) -> list[str]:
     """The words of a field's name, in small letters and without its unit."""
     plain = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", "_", without_unit(name)[0])
+    plain = _UNSPACED.sub(r"_\1_", plain)
     words = [part for part in re.split(r"[\W_]+|(2)", plain.lower()) if part]
     for at in (at for at, word in enumerate(words[1:-1], 1) if word == "2"):
         ends = (words[at - 1], words[at + 1])

@@ -142,9 +142,10 @@ def small_part(
     )
 
 
-def armless_note(foreign: ForeignRecording) -> Iterator[str]:
+def armless_note(foreign: ForeignRecording, requested: ImportOptions) -> Iterator[str]:
     """A note on joint angles of an arm that nobody names."""
-    is_armless = foreign.arm is None and foreign.robot_document is None
+    is_armless = requested.robot_model is None and foreign.arm is None
+    is_armless &= foreign.robot_document is None
     if is_armless and foreign.joints_rad is not None and not foreign.robot.present.any():
         yield (
             "There are joint angles and no poses of the robot: calibrate needs the arm, as by "

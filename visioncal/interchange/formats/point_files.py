@@ -1,0 +1,171 @@
+"""Measured points and the robot's poses that stand in several files, or in turn without names."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.core.number_format import counted, some_of
+from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.fields import Fields, joined
+from visioncal.interchange.formats.foreign import ImportOptions
+from visioncal.interchange.formats.point_tables import PointTable
+from visioncal.interchange.formats.poses import possible_poses
+
+# Most that distances of points on one flange change by, as a share of how far they move: an arm
+# moves them by some hundreds of millimetres, and their distances change by what they were read to.
+_RIGID = 0.02
+# Points of one place, as a drawing's beside measured ones, are as far from each other as these
+# differ by chance.
+_APART = 5.0
+# How much less distances change in one order of rows than in another, where it is theirs.
+_CLEARLY = 10.0
+
+
+def split_states(rows: Sequence[Fields], requested: ImportOptions) -> list[PointTable]:
+    """The robot's poses whose positions and rotations are in a file each, as `pos_tcp, rotvec_tcp`.
+
+    Raises DataError where names that the user gives are none of the files'.
+    """
+    found = list[PointTable]()
+    files = [fields for fields in rows if _three(fields)]
+    given = {*requested.robot.names}
+    for count in dict.fromkeys(map(len, files)):
+        whole = [fields for fields in files if len(fields) == count]
+        for merged in joined(whole, whole[0].name, whole[0].folder, prefixed=True):
+            asked = requested if given <= {*merged.numbers} else _without_names(requested)
+            table = PointTable.of(merged, whole[0].folder / whole[0].name, asked)
+            named = [item.names for item in possible_poses(merged) if item.is_named]
+            pairs = [names for names in named if len(names) == 2]
+            of_two = (table.poses, *pairs) if len(table.poses) == 2 else pairs[: len(pairs) == 1]
+            for names in of_two[:1]:
+                left = [", ".join(other) for other in pairs if other != names]
+                note = f"The robot's poses are {', '.join(names)}; left aside: {some_of(left)}. "
+                noted = replace(
+                    table.fields, notes=(f"{note}--robot-key names them.",) * bool(left)
+                )
+                found.append(replace(table, fields=noted, poses=names, file=", ".join(names)))
+    return found
+
+
+def _without_names(requested: ImportOptions) -> ImportOptions:
+    return replace(requested, robot=replace(requested.robot, names=()))
+
+
+def parts_of_poses(rows: Sequence[Fields]) -> set[str]:
+    """Names of files that are positions or rotations of poses in two files each."""
+    files = [fields for fields in rows if _three(fields)]
+    return {
+        name
+        for merged in (
+            joined(files, files[0].name, files[0].folder, prefixed=True) if files else ()
+        )
+        for item in possible_poses(merged)
+        if item.is_named and len(item.names) == 2
+        for name in item.names
+    }
+
+
+def _three(fields: Fields) -> bool:
+    """Whether rows are three numbers and nothing else."""
+    return sum(int(np.prod(each.shape[1:])) for each in fields.numbers.values()) == 3 and (
+        {*fields.texts} <= {*fields.numbers}
+    )
+
+
+def together(tables: Sequence[PointTable], count: int) -> tuple[PointTable, tuple[str, ...]]:
+    """Tables of one point each at all stops of the robot as one, and a note on those left aside.
+
+    Points of one flange keep their distances. `count` is that of the stops.
+    """
+    first, *others = tables
+    own = _places(first)
+    names = [*first.points().values()]
+    alike = [first]
+    for table in others if len(first.fields) == count and not _is_named(first) else ():
+        fits = len(table.fields) == count and not _is_named(table)
+        if fits and [*table.points().values()] == names and _are_rigid(own, _places(table)):
+            alike.append(table)
+    left = [f"{t.file} ({counted(len(t.fields), 'row')})" for t in others if t not in alike]
+    notes = (
+        f"Left aside: {some_of(left)}. Points of several files are read together where each has a "
+        "row a stop of the robot and they keep their distances; others as rows of one table with "
+        "columns `stop` and `point`.",
+    ) * bool(left)
+    if len(alike) == 1:
+        return first, notes
+    labels = [re.sub(r"\W+", "_", table.fields.name) for table in alike]
+    columns = names[0]
+    fields = Fields(
+        name=first.fields.name,
+        folder=first.fields.folder,
+        places=tuple(place for table in alike for place in table.fields.places),
+        numbers={
+            name: np.concatenate([table.fields.column(name)[:, 0] for table in alike])
+            for name in columns
+        },
+        texts={
+            "stop": tuple(str(at + 1) for _ in alike for at in range(count)),
+            "point": tuple(label for label in labels for _ in range(count)),
+        },
+    )
+    note = f"Points of the files {some_of(labels)} are read together: they keep their distances."
+    file = ", ".join(table.file for table in alike)
+    return replace(first, fields=fields, poses=(), joints=(), file=file), (note, *notes)
+
+
+def in_turn(points: PointTable, count: int) -> tuple[list[object], list[str], str] | None:
+    """Stops and points of rows without names, several times as many as the robot's stops; and how.
+
+    Points at a stop follow one another, or stops of a point: distances that stay say which. None
+    where neither is clear.
+    """
+    rows = len(points.fields)
+    if rows % count or rows == count or _is_named(points):
+        return None
+    several, places = rows // count, _places(points)
+    at = np.arange(rows)
+    orders = {
+        "in turn at each stop": (at // several, at % several),
+        "one after the other, each at all stops": (at % count, at // count),
+    }
+    changes = {
+        how: _change(places[np.lexsort((spots, stops))].reshape(count, several, 3))
+        for how, (stops, spots) in orders.items()
+    }
+    best, other = sorted(orders, key=changes.__getitem__)
+    if not changes[best] < min(_RIGID, changes[other] / _CLEARLY):
+        return None
+    stops, spots = orders[best]
+    keys = list[object](stops.tolist())
+    note = f"{several} points are taken {best} of the robot: so they keep their distances."
+    return keys, [str(spot + 1) for spot in spots], note
+
+
+def _is_named(table: PointTable) -> bool:
+    """Whether texts name the rows."""
+    return any(name not in table.fields.numbers for name in table.fields.texts)
+
+
+def _places(table: PointTable) -> FloatArray:
+    """(n, 3) measured places, in the file's unit; NaN without."""
+    names = next(iter(table.points().values()), ())
+    if not names:
+        return np.full((len(table.fields), 3), np.nan)
+    return np.hstack([table.fields.column(name) for name in names])
+
+
+def _change(places: FloatArray) -> float:
+    """How much distances of (n, k, 3) points change, as a share of how far they move."""
+    first, second = np.triu_indices(places.shape[1], 1)
+    lengths = np.linalg.norm(places[:, first] - places[:, second], axis=2)
+    moved = np.linalg.norm(places - np.nanmean(places, axis=0), axis=2)
+    return float(np.nanstd(lengths, axis=0).max() / max(float(np.nanmedian(moved)), 1e-12))
+
+
+def _are_rigid(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two (n, 3) points keep their distance, and are not one place."""
+    lengths = np.linalg.norm(one - other, axis=1)
+    is_apart = np.nanmean(lengths) > _APART * np.nanstd(lengths)
+    return bool(is_apart and _change(np.stack([one, other], axis=1)) < _RIGID)
