@@ -269,6 +269,30 @@ def test_robots_of_a_cell_are_read_anew_one_by_one(tmp_path, monkeypatch, three,
             np.testing.assert_allclose(second.as_matrix(), first.as_matrix(), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("column", "names", "stops"),
+    [slow("camera", ("left", "right"), (4, 5, 6)), ("target", ("plate_a", "floor"), (3, 7, 9))],
+)
+def test_rows_with_the_name_of_another_camera_or_board_are_named(column, names, stops):
+    right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=CAMERAS["fine"])
+    cell = simulate(replace(OPTIONS, cameras=(*OPTIONS.cameras, right), stops=14))
+    session, other = cell_session(cell, "cell", seen="poses"), dict([names, names[::-1]])
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    wrong = dict[int, str]()
+    for view, row in zip(session.views, cells, strict=True):
+        if view.stop in stops and row["camera"] != "hand" and row[column] in other:
+            row[column] = wrong[view.number] = other[row[column]]
+    rows = [[row[name] for name in session.columns] for row in cells]
+    found = calibrate(session.with_content(document=session.document, cells=rows))
+    (cause,) = (at for at in found.verdict.causes if at.kind == "misnamed_rows")
+    assert cause is found.verdict.causes[0]
+    assert {*cause.views} == {*wrong}
+    for name in names:
+        views = [view for view in cause.views if wrong[view] == name]
+        assert f"{other[name]} for {name} in column {column} of view" in cause.do.words
+        assert all(str(view) in cause.do.words for view in views[:8])
+
+
 @pytest.mark.slow
 def test_a_sound_cell_stays_as_it_is_where_other_readings_are_tried(tmp_path, monkeypatch, three):
     monkeypatch.chdir(tmp_path)

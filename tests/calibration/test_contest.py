@@ -120,6 +120,25 @@ def test_a_cause_is_sure_where_its_cure_leaves_noise():
     assert not moved.is_proven
 
 
+def test_a_camera_that_moved_twice_is_named_with_the_frame_of_either_change():
+    """Coarse poses of a marker leave no view out, and each change is more than an arm errs by."""
+    rng, twists = np.random.default_rng(0), np.zeros((3, 6))
+    twists[1:, 2:] = [[0.0, 0.012, 0.006, 0.0], [0.01, -0.012, 0.008, 0.004]]
+    spread = rng.normal(size=(45, 6)) * np.repeat([0.3, 0.1], 3)
+    robot = exp(spread + np.array([3.0, 0.0, 0.0, 0.6, 0.0, 0.4]))
+    edges = exp(np.array([[0.1, 0.2, -1.5, 0.03, 0.05, 0.1], [3.0, 0.1, 0.2, 0.6, 0.1, 0.0]]))
+    noise = exp(rng.normal(size=(45, 6)) * np.repeat([6e-3, 4e-3], 3))
+    seen = invert(robot @ edges[0] @ exp(twists)[np.arange(45) // 15]) @ edges[1] @ noise
+    session = pairs_session("eye-in-hand", robot, seen)
+    (words,) = (
+        cause.words
+        for cause in visioncal.calibrate(session).verdict.causes
+        if cause.kind == "moved_at_once"
+    )
+    assert words.startswith("The camera moved at once, twice: from view 15 on, it is ")
+    assert ", or the controller's tool is another one, by (" in words
+
+
 @pytest.mark.slow
 def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():
     """An arm that goes over to its other shoulder has its errors the other way at once."""

@@ -1129,6 +1129,18 @@ def test_a_cause_that_inflates_all_sigmas_is_named_with_the_accuracy() -> None:
     assert "and of less once the first cause is mended" in words
 
 
+@pytest.mark.parametrize(("sigma_m", "status"), [(2e-3, "check"), (4e-3, "bad")])
+def test_a_step_hides_no_sigma_of_which_a_result_is_of_no_use(sigma_m, status) -> None:
+    """Below its limit a sigma is the step's effect; beyond, the transform is not to be used."""
+    step = Finding("moved_at_once", "The target moved.", mahalanobis_sq=400.0)
+    verdict = judge(replace(SOUND, worst=directions(sigma_m, 0, 0, 0), warnings=(step,)))
+    assert verdict.status == status
+    assert verdict.findings[0].kind == "moved_at_once"
+    # More views would not help.
+    weak = [at for at in verdict.findings if at.kind == "weak_motion"]
+    assert [at.do for at in weak] == [None] * (status == "bad")
+
+
 @pytest.mark.parametrize("sigma_mm", [0.1, 0.102])
 def test_a_result_is_good_for_the_need_that_it_prints(sigma_mm: float) -> None:
     found = replace(SOUND, picks=(of_size(sigma_mm),))

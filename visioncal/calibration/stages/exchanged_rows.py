@@ -14,6 +14,9 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 
+# Times by which an outlier is nearer where it has another name: by chance, two hardly are.
+_NEARER = 30.0
+
 
 def other_stops(
     problem: Problem,
@@ -70,6 +73,44 @@ def _at_stops(
     squares = np.full(len(stops), np.inf)
     squares[known] = by_noise_alone(at_stops.subset(known), fit)
     return squares
+
+
+def other_names(
+    problem: Problem, fit: Solution, out: IntArray, moves: Sequence[Move]
+) -> dict[int, tuple[str, str]]:
+    """Frames `(observer, observed)` that outliers fit at their own stop, one of both another one.
+
+    A lens or a board that is not the named one leaves a pose that is off by much more than noise,
+    and by far less than another place. Arguments as of `other_stops`.
+    """
+    seen, found = problem.observations, dict[int, tuple[str, str]]()
+    frames = {*problem.tree.branches, problem.tree.root}
+    for at in out.tolist():
+        own = tuple(pair[at].partition("@")[0] for pair in (seen.observers, seen.observed))
+        likes = [
+            sorted(name for name in frames if name.partition("_")[0] == frame.partition("_")[0])
+            for frame in own
+        ]
+        pairs = [
+            own,
+            *((name, own[1]) for name in likes[0]),
+            *((own[0], name) for name in likes[1]),
+        ]
+        pairs = [*dict.fromkeys(pairs)]
+        repeated = np.full(len(pairs), at)
+        observers, observed = zip(*pairs, strict=True)
+        named = replace(seen.take(repeated), observers=observers, observed=observed)
+        for move in moves:
+            named = named.renamed(move.frame, move.twin, named.stops >= move.stop)
+        effects = tuple(effect.take(repeated) for effect in problem.effects)
+        as_named = replace(problem, observations=named, effects=effects)
+        known = np.isfinite(as_named.predicted(fit.state)[:, 0, 0])
+        squares = np.full(len(pairs), np.inf)
+        squares[known] = by_noise_alone(as_named.subset(known), fit)
+        best = int(squares.argmin())
+        if best and _NEARER**2 * squares[best] < squares[0]:
+            found[at] = pairs[best]
+    return found
 
 
 def exchanged(

@@ -53,15 +53,15 @@ def collect_findings(judged: Findings) -> list[Finding]:
             scatter = [replace(scatter[0], words=words, do=robots[0].do)]
         robots = []
     # With fatal scatter, sigmas say nothing about the motion. A step inflates all of them, and more
-    # views do not help.
-    is_wild = is_fatal or any(
-        "calibration" in SUSPECTS[found.kind].inflates for found in judged.warnings
-    )
+    # views do not help: they count where they are so large that the result is of no use.
+    sigmas = [] if is_fatal else [*_sigmas(judged), *_place(judged), *_workspace(judged)]
+    if any("calibration" in SUSPECTS[found.kind].inflates for found in judged.warnings):
+        sigmas = [replace(found, do=None) for found in sigmas if found.is_fatal]
     return [
         *scatter,
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _holdout(pair)),
-        *([] if is_wild else [*_sigmas(judged), *_place(judged), *_workspace(judged)]),
+        *sigmas,
         *few_stops(judged, sum(view.used for view in judged.views)),
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _lost_views(sensor)),
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _corner_noise(sensor)),

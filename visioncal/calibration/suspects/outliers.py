@@ -9,7 +9,7 @@ from itertools import chain, pairwise
 import numpy as np
 
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
-from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
+from visioncal.calibration.stages.exchanged_rows import exchanged, other_names, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, listed, mm_and_deg, ranges, some_of, view_words
@@ -28,10 +28,13 @@ from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.steps import step_of
 from visioncal.results import Moved
 from visioncal.robot import Robot
-from visioncal.session.frames import frame_name
+from visioncal.session.frames import frame_name, object_name
 from visioncal.vision.targets import rotation_transforms
 
-EXCHANGED = "exchanged_views"  # The kind of finding, which others name.
+# Kinds of findings, which others name.
+EXCHANGED, MISNAMED = "exchanged_views", "misnamed_rows"
+# Rows that no chance has fit another name.
+_FEWEST_MISNAMED = 2
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 # Views among many outliers of one end that agree by chance, one of so many; what a step that few
 # times exceeds the noise leaves of these, and poses that are wrong apart never do.
@@ -121,7 +124,7 @@ def explained_outliers(
     if cell_fit.cell.mount is not None and not faults:
         faults += _moved_run(cell_fit)
     if cell_fit.cell.mount is None and not faults:
-        faults += _pushed_base(cell_fit)
+        faults += [*_misnamed(cell_fit, outliers)] or _pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, circles) for at in outliers.tolist()} | clauses
     return tuple(faults), *_reasons(cell_fit, causes)
@@ -186,6 +189,33 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         how += ", or another load bends the arm"
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
+
+
+def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
+    """Outliers that fit where their camera or their target has the name of another one."""
+    inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
+    found = other_names(inliers.problem, inliers.fit, outliers, inliers.moves)
+    by_names = defaultdict[tuple[str, str], list[int]](list)
+    for at, names in found.items():
+        own = rows[at].seer, rows[at].seen
+        side = int(own[0].partition("@")[0] == names[0])
+        by_names[own[side].partition("@")[0], names[side]].append(at)
+    several = {names: some for names, some in by_names.items() if len(some) >= _FEWEST_MISNAMED}
+    if not several:
+        return
+    every, edits = sorted(chain.from_iterable(several.values())), list[str]()
+    for (stated, other), some in several.items():
+        views = [rows[at].view for at in some]
+        column = "camera" if stated.startswith("cam") else stated.partition("_")[0]
+        edits.append(
+            f"{object_name(other, column)} for {object_name(stated, column)} in column {column} of "
+            f"{view_words(views)}"
+        )
+    named = listed([f"{stated} is {other}" for stated, other in several])
+    short = "the name of its camera or of its target is another one's"
+    words = f"{{views}} were left out: they fit where {named}, as rows with exchanged names do."
+    do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
+    yield _fault(cell_fit, MISNAMED, every, words, do, short)
 
 
 def _pushed_base(cell_fit: CellFit) -> Iterator[PoseFault]:

@@ -21,7 +21,7 @@ from visioncal.calibration.suspects import (
     turned_views,
 )
 from visioncal.calibration.suspects.moved_frames import crept_findings, moved_findings
-from visioncal.calibration.suspects.outliers import EXCHANGED
+from visioncal.calibration.suspects.outliers import EXCHANGED, MISNAMED
 from visioncal.calibration.suspects.suspect import (
     ARM_ERRORS,
     FACT,
@@ -71,7 +71,7 @@ def _unseen(run: RunState) -> Iterator[Finding]:
 _ENTRIES: tuple[Suspect, ...] = (
     # Views.
     Suspect(EXCHANGED, _outliers, 1e-6, order=-1),
-    *(Suspect(kind, None, 1e-6, order=-1) for kind in UNDONE),
+    *(Suspect(kind, None, 1e-6, order=-1) for kind in (MISNAMED, *UNDONE)),
     Suspect("something_moved", chance=1e-4),
     Suspect("moved_frame", chance=1e-4),
     Suspect("frame_creeps", chance=1e-4),

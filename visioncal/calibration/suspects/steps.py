@@ -107,7 +107,7 @@ def _words(step: Step, run: RunState) -> str:
         fit = run.assessment.sized
         stepped, solved = with_step(fit.problem, fit.solution, step)
         edges = stepped.frames(solved.state)
-        before, after = (edges[at] for at in stepped.unknown if at.partition("@")[0] == step.of)
+        *_, before, after = (edges[at] for at in stepped.unknown if at.partition("@")[0] == step.of)
         words += f", or the controller's {'tool' if on_flange else 'base frame'} is another one"
         words += f", by {other_frame(before, after)}"
     return words
