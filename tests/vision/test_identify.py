@@ -458,3 +458,32 @@ def test_a_declared_checkerboard_is_found_beside_a_larger_one():
     target = Target("board", "checkerboard", 7, 5, 0.03, 3e-5)
     found = detect(Session.from_arrays(images, np.tile(np.eye(4), (3, 1, 1)), target))
     assert sorted(found.corners) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("rim", [3, 6, 9])
+def test_a_board_printed_close_to_its_edge_is_named_by_its_own_lines(rim):
+    """OpenCV's search for any count takes the rim's edge for a line of corners."""
+    side, size, rng = 60, (1920, 1080), np.random.default_rng(rim)
+    rows, columns = np.indices((8 * side, 10 * side)) // side
+    board = np.where((rows + columns) % 2 == 0, 25, 225).astype(np.uint8)
+    board = cv2.copyMakeBorder(board, rim, rim, side, side, cv2.BORDER_CONSTANT, value=225)
+    height, width = board.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    share = 0.78 * size[1] / height
+    placed = share * (corners - [width / 2, height / 2]) + np.array(size) / 2
+    placed = (placed + rng.uniform(-10, 10, (4, 2))).astype(np.float32)
+    image = cv2.warpPerspective(
+        board,
+        cv2.getPerspectiveTransform(corners, placed),
+        size,
+        dst=np.full(size[::-1], 60, np.uint8),
+        flags=cv2.INTER_AREA,
+        borderMode=cv2.BORDER_TRANSPARENT,
+    )
+    identity = identify(cv2.GaussianBlur(image, (0, 0), 1.0))
+    assert (identity.board.kind, identity.board.columns, identity.board.rows) == (
+        "checkerboard",
+        9,
+        7,
+    )
+    assert identity.corners_seen == 63

@@ -1,6 +1,7 @@
 """Checkerboards: inner corners of plain squares."""
 
 from collections.abc import Iterator
+from itertools import product
 from typing import ClassVar, Literal
 
 import cv2
@@ -35,6 +36,8 @@ _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
 _RIM = 0.3
 # Share of the way from a corner to the middle of a dark square; usual circles end before.
 _TIP = 0.2
+# Share of a square around a corner within which edges refine it, and until when: by 0.01 px.
+_AROUND, _UNTIL = 0.25, (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
 # About the longer side of the image in which outlines of squares are looked for: among the noise of
 # more pixels their search takes most of a minute. A smaller copy loses small squares, so that up to
 # half as many more pixels a side are kept and smoothed by some [px].
@@ -131,19 +134,20 @@ class Checkerboard(Board):
         for size in _FEWEST:
             found, px, meta = cv2.findChessboardCornersSBWithMeta(image, size, flags=flags)
             grid = px.reshape(*meta.shape, 2).astype(float) if found else np.zeros((0, 0, 2))
-            # Checked before the second look, which takes long where it finds nothing.
-            if not found or not _is_checkered(image, grid) or _ends(image, grid) is False:
-                continue
-            columns, rows = sorted(meta.shape, reverse=True)
-            board = Target("board", self.name, columns, rows, 1.0, DEFAULT_RELATIVE_SIGMA)
-            # A second look, as this search takes parts of some boards for the whole.
-            seen = self.search(image, board, quick=True)
-            if isinstance(seen, NotFound):
-                seen = self.search(image, board)
-            if isinstance(seen, DetectedCorners):
-                grid = seen.px.reshape(rows, columns, 2)
-                is_plain = _has_tips(image, grid) and not _has_marks(image, grid)
-                return (board, _ends(image, grid) is True) if is_plain else None
+            for part in _parts(grid) if found else ():
+                # Checked before the second look, which takes long where it finds nothing.
+                if not _is_checkered(image, part) or _ends(image, part) is False:
+                    continue
+                columns, rows = sorted(part.shape[:2], reverse=True)
+                board = Target("board", self.name, columns, rows, 1.0, DEFAULT_RELATIVE_SIGMA)
+                # A second look, as this search takes parts of some boards for the whole.
+                seen = self.search(image, board, quick=True)
+                if isinstance(seen, NotFound):
+                    seen = self.search(image, board)
+                if isinstance(seen, DetectedCorners):
+                    grid = seen.px.reshape(rows, columns, 2)
+                    is_plain = _has_tips(image, grid) and not _has_marks(image, grid)
+                    return (board, _ends(image, grid) is True) if is_plain else None
         return None
 
     def without(self, image: Image, target: Target) -> Image:
@@ -157,16 +161,31 @@ class Checkerboard(Board):
 
 
 def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[FloatArray]:
-    """(rows, columns, 2) grids of corners that one search after the other takes for the board."""
-    fine, (columns, rows) = cv2.CALIB_CB_ACCURACY, size
-    thorough = fine | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-    for flags in (0,) if quick else (fine, thorough):
-        found, px = cv2.findChessboardCornersSB(image, size, flags=flags)
-        if found:
-            yield px.reshape(rows, columns, 2).astype(np.float64)
+    """(rows, columns, 2) grids of corners that one search after the other takes for the board.
+
+    The quickest comes first: that by outlines takes a tenth of the thorough ones, and also finds
+    boards whose corners these lose.
+    """
     if quick:
+        yield from _by_corners(image, size, 0)
         return
-    # By the outlines of squares, some boards are found whose corners the other search loses.
+    yield from _by_outlines(image, size)
+    fine = cv2.CALIB_CB_ACCURACY
+    yield from _by_corners(image, size, fine)
+    yield from _by_corners(
+        image, size, fine | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+
+
+def _by_corners(image: Image, size: tuple[int, int], flags: int) -> Iterator[FloatArray]:
+    """The (rows, columns, 2) grid that OpenCV's search for corners finds, if it does."""
+    found, px = cv2.findChessboardCornersSB(image, size, flags=flags)
+    if found:
+        yield px.reshape(*size[::-1], 2).astype(np.float64)
+
+
+def _by_outlines(image: Image, size: tuple[int, int]) -> Iterator[FloatArray]:
+    """The (rows, columns, 2) grid that OpenCV's search for outlines of squares finds, if any."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     by = max(1, round(max(image.shape) / _OUTLINES_PX))
     if by > 1:
@@ -175,8 +194,25 @@ def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[Floa
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTHED_PX), np.uint8)
     found, px = cv2.findChessboardCorners(image, size, flags=flags)
     if found:
+        # Outlines meet within a pixel of the corner.
+        steps = np.linalg.norm(np.diff(px.reshape(*size[::-1], 2), axis=1), axis=2)
+        reach = max(round(_AROUND * float(steps.min())), 1)
+        px = cv2.cornerSubPix(image, px, (reach, reach), (-1, -1), _UNTIL)
         # From pixel centres of the small image to those of the large one.
-        yield by * px.reshape(rows, columns, 2).astype(np.float64) + (by - 1) / 2
+        yield by * px.reshape(*size[::-1], 2).astype(np.float64) + (by - 1) / 2
+
+
+def _parts(grid: FloatArray) -> Iterator[FloatArray]:
+    """A (rows, columns, 2) grid, then it without some of its outermost lines, fewest first.
+
+    Where a board is printed to its edge, OpenCV's search for any count takes that for a line.
+    """
+    height, width, _ = grid.shape
+    cuts = sorted(product((0, 1), repeat=4), key=sum)
+    for top, bottom, left, right in cuts:
+        part = grid[top : height - bottom, left : width - right]
+        if min(part.shape[:2]) >= _FEWEST[-1][0]:
+            yield part
 
 
 def square_corners(target: Target, inset: int) -> FloatArray:
