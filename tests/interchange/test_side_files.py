@@ -309,3 +309,22 @@ def test_seven_angle_positions_are_joints(tmp_path):
 def _saved(path: Path, arrays) -> Path:
     savemat(path, arrays)
     return path
+
+
+def test_the_length_of_a_grid_of_circles_is_that_of_its_rows(tmp_path):
+    """Makers state the distance of circles within a row, which is twice as long."""
+    (tmp_path / "in").mkdir()
+    for at, pose in enumerate(matrices(4)):
+        picture = np.full((480, 640), 235, np.uint8)
+        for row in range(11):
+            for column in range(4):
+                place = (170 + 60 * column + 30 * (row % 2) + 5 * at, 80 + 30 * row)
+                cv2.circle(picture, place, 11, 30, -1, cv2.LINE_AA)
+        cv2.imwrite(str(tmp_path / f"in/{at}.png"), picture)
+        write(tmp_path / f"in/{at}.json", {"base_from_flange": pose.tolist()})
+    said = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    said = said.refused().err
+    assert "is not stated: an asymmetric grid of 4 x 11 circles" in said
+    assert "Measure the distance from one row of circles to the next" in said
+    assert "half of that between circles of a row" in said
+    assert "side of a square" not in said

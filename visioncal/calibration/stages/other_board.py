@@ -17,7 +17,13 @@ from visioncal.session.images import FolderImages
 from visioncal.session.kinds import declared_targets
 from visioncal.vision.boards import NotFound, find_target, kind_of
 from visioncal.vision.boards.checkerboard import Checkerboard
-from visioncal.vision.boards.identify import Identity, describe, identify, identify_plain
+from visioncal.vision.boards.identify import (
+    Identity,
+    describe,
+    identify,
+    identify_plain,
+    with_article,
+)
 from visioncal.vision.targets import (
     board_words,
     corner_positions,
@@ -105,7 +111,7 @@ def other_board(
     if identity.is_mirrored:
         return Finding(
             "mirrored_images",
-            f"The images are mirrored: a {describe(identity)}{where}, is seen only "
+            f"The images are mirrored: {with_article(identity)}{where}, is seen only "
             "where they are mirrored back.",
             Remedy(
                 "Write a copy of the session with its images mirrored back, and calibrate it; "
@@ -117,8 +123,8 @@ def other_board(
     if identity.is_negative and not found:
         return Finding(
             "negative_images",
-            f"The board is printed in white on black, or the images are negatives: a "
-            f"{describe(identity)}{where}.",
+            "The board is printed in white on black, or the images are negatives: "
+            f"{with_article(identity)}{where}.",
             Remedy(
                 "Write a copy of the session with light and dark exchanged, and calibrate it; "
                 "where the print is as it should be, turn the negative off in the camera's driver.",

@@ -30,7 +30,7 @@ from visioncal.session.corners import CornerTable
 from visioncal.session.images import CLOUD_ENDINGS, ListedImages
 from visioncal.session.table import check_two_sides
 from visioncal.vision.boards import kind_of
-from visioncal.vision.boards.identify import describe, identify
+from visioncal.vision.boards.identify import identify, with_article
 from visioncal.vision.boards.imaging import image_size, looks_like_image, read_image
 from visioncal.vision.targets import target_name
 
@@ -271,7 +271,7 @@ def _seen_board(images: Sequence[Path]) -> tuple[str, str]:
         is_sure &= seen.shown >= min(2, len(some))
         if is_sure and seen.corners_seen >= LEAST_CORNERS * seen.corners:
             return (
-                f"stated: a {describe(seen)}",
+                f"stated: {with_article(seen)}",
                 f"Measure the {kind_of(seen.board).side}, write it [mm] in place of 30, and give "
                 "--target board.toml, which this makes:\nvisioncal target check "
                 f"{shlex.join(map(str, some))} --square-mm 30 -o board.toml\nElse give",

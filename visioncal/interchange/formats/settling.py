@@ -358,7 +358,8 @@ def _untested(
             other.words,
             culprits=["--target"],
             next_step="Name this board with --target, by its kind, its columns x rows and the "
-            "measured side (as checkerboard_9x6_25mm), or by its .toml.",
+            "measured side (as checkerboard_9x6_25mm, or circles_4x11_20mm_asymmetric of "
+            "staggered rows 20 mm apart), or by its .toml.",
         )
     # Other images make no difference where the stored poses of the target are used.
     is_stored = foreign.camera is not None and foreign.target is None

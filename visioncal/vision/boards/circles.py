@@ -58,6 +58,10 @@ class CircleGrid(Board):
     options = "--columns --rows --square-mm --diameter-mm --asymmetric --name"
     keys = f"{Board.keys} diameter_m asymmetric"
     in_a_word = rf"{COUNTS}_(?P<square_m>{MM})mm(?P<asymmetric>_asymmetric)?"
+    side = (
+        "distance from one row of circles to the next, between centres (of staggered rows half of "
+        "that between circles of a row)"
+    )
     sides, unit = "a distance of rows", "distance"
     symmetric: ClassVar[Literal["", "squares", "places"]] = "places"
 

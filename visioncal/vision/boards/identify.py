@@ -451,6 +451,12 @@ class _Grid:
             yield f"Its visible part fits {listed(more)} columns as well: show more of the board."
 
 
+def with_article(identity: Identity) -> str:
+    """The target in a few words, with an indefinite article."""
+    words = describe(identity)
+    return f"{'an' if words[0].lower() in 'aeiou' else 'a'} {words}"
+
+
 def describe(identity: Identity) -> str:
     """The target in a few words."""
     board = identity.board
