@@ -1141,6 +1141,30 @@ def test_a_step_hides_no_sigma_of_which_a_result_is_of_no_use(sigma_m, status) -
     assert [at.do for at in weak] == [None] * (status == "bad")
 
 
+def test_a_turn_that_a_lens_leaves_open_is_not_blamed_on_a_board() -> None:
+    """No size of a board turns anything, and views that are tilted enough are not too few."""
+    picks = (of_size(0.3),)
+    turned = replace(SOUND, worst=directions(1e-4, np.deg2rad(0.12)), picks=picks)
+    (weak,) = (at for at in judge(turned).findings if at.kind == "weak_motion")
+    assert weak.words.startswith("Weakly determined by the motion, ")
+    (weak,) = (at for at in judge(replace(turned, by_lens=True)).findings if at.probability)
+    assert weak.words.startswith("Weakly determined by how well the views determine the lens, ")
+    assert weak.do is not None
+    assert weak.do.words.startswith("State a lens that was calibrated with more images (matrix ")
+
+
+def test_coarse_corners_leave_an_estimated_lens_open_and_no_stated_one() -> None:
+    cell = CellOptions(seed=1, mount="eye-to-hand", views=16, pixel_sigma_px=0.6)
+    weak = list[list[str]]()
+    for known in (False, True):
+        session = cell_session(simulate(replace(cell, state_intrinsics=known)), "c", seen="corners")
+        found = calibrate(session).verdict.findings
+        weak.append([at.words for at in found if at.kind == "weak_motion"])
+    (words,), stated = weak
+    assert "by how well the views determine the lens" in words
+    assert not any("lens" in words for words in stated)
+
+
 @pytest.mark.parametrize("sigma_mm", [0.1, 0.102])
 def test_a_result_is_good_for_the_need_that_it_prints(sigma_mm: float) -> None:
     found = replace(SOUND, picks=(of_size(sigma_mm),))

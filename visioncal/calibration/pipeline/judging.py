@@ -37,6 +37,7 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
+from visioncal.estimation.unknowns import LENS
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 from visioncal.robot.model import REPEATABILITY
 
@@ -58,6 +59,10 @@ def judge_run(state: RunState) -> RunState:
     return replace(state, warnings=warnings, findings=findings, verdict=verdict)
 
 
+# Share of a variance that is left without a source to which most of it is due.
+_LEAVES = 0.3
+
+
 def findings_of(run: RunState) -> Findings:
     """Collects the input of the verdict."""
     answer = run.assessment
@@ -75,7 +80,22 @@ def findings_of(run: RunState) -> Findings:
         predict_picks(_pick_inputs(run, explained), run.session.need),
         run.session.corrects_targets,
         _use(run),
+        _is_by_lens(run),
     )
+
+
+def _is_by_lens(run: RunState) -> bool:
+    """Whether most of the variance of the weakest direction is that of an estimated lens."""
+    fit, worst = run.assessment.fit, _worst(run)
+    lens = fit.unknowns.of_kinds(LENS)
+    is_estimated = any(look.table.stated is None for look in run.cameras.values())
+    if run.mount is None or not (is_estimated and len(lens)):
+        return False
+    inner, names = fit.whole[np.ix_(lens, lens)], chain_words(fit.problem, run.mount).names
+    known = fit.whole - fit.whole[:, lens] @ np.linalg.pinv(inner, hermitian=True) @ fit.whole[lens]
+    beside = [found for _, found in directions(fit.problem, fit.state, known, names)]
+    at = max(range(len(worst)), key=lambda at: worst[at].sigma / worst[at].limit)
+    return bool(beside[at].sigma ** 2 < _LEAVES * worst[at].sigma ** 2)
 
 
 def _use(run: RunState) -> Remedy:

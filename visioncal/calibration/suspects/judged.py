@@ -90,6 +90,8 @@ class Findings:
     picks: Sequence[Picks] = ()
     corrects_targets: bool = False  # Whether targets are corrected for a calibrated arm.
     use: Remedy | None = None  # How a good result is used.
+    # Whether most of the variance of the least certain direction would go with a known lens.
+    by_lens: bool = False
 
     @property
     def judged_picks(self) -> tuple[Picks, ...]:

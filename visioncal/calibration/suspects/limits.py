@@ -32,6 +32,11 @@ _LISTED = 3
 _FAR_MM, _MUCH_FARTHER = 20.0, 10.0
 # Levers from joints that scatter to the flange: from a wrist to a long arm [m].
 _LEVERS_M = (0.1, 1.5)
+_STATE_LENS = Remedy(
+    "State a lens that was calibrated with more images (matrix and distortion of its [camera]), or "
+    "add images of the board held by hand: near, tilted, and in the corners of the image "
+    "(role = intrinsics in views.csv)."
+)
 _ARM_SCATTERS = (
     "Read each pose and take each picture once the arm stands still, and read poses that are "
     "measured, not commanded. Where it does, it repeats no better, as a servo arm or one whose "
@@ -245,7 +250,7 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
     # compensate them in all poses: of it the workspace counts.
     if all(arm.workspace_mm is not None for arm in judged.arms):
         return
-    weak, is_fatal = [], False
+    weak, offsets, is_fatal = list[str](), list[float](), False
     for direction in judged.worst:
         scale, unit, (check, bad) = 1e3, "mm", _LIMITS.sigma_mm
         if direction.is_rotation:
@@ -253,19 +258,20 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
         if (sigma := direction.sigma * scale) > check:
             weak.append(f"{direction.words} ({sigma_words(sigma, unit)})")
             is_fatal |= sigma > bad
+            offsets += [] if direction.is_rotation else [direction.sigma]
     if not weak:
         return
     step, by = _tilted(judged), "by the motion"
-    # The greater part of their variances, where views see the board.
+    # The greater part of their variances, where views see the board; no size turns anything.
     board_m = 1e-3 * _uncertainty_mm(judged)[1]
-    is_of_board = all(
-        board_m > 0.7 * found.sigma for found in judged.worst if not found.is_rotation
-    )
+    is_of_board = bool(offsets) and all(board_m > 0.7 * sigma for sigma in offsets)
     if any(warning.do == NO_JOINTS for warning in judged.warnings):
         step, by = NO_JOINTS, "by the arm's own errors"
     elif any(arm.are_lasting for arm in judged.arms):
         # They are no finding where chance may explain them, or no arm errs by as much.
         step, by = _against_lasting(judged), "by errors that last from view to view"
+    elif judged.by_lens:
+        step, by = _STATE_LENS, "by how well the views determine the lens"
     elif _is_of_board(judged) and is_of_board:
         step, by = MEASURE_BOARD, "by how well the board's size is stated"
     words = (
