@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from benchmarks import elsewhere
+from scipy.spatial.transform import Rotation
 from support.cells import calibrated, pairs_session, reporting
 from support.misfits import misfit
 from support.refusals import raised
@@ -137,6 +138,32 @@ def test_a_camera_that_moved_twice_is_named_with_the_frame_of_either_change():
     )
     assert words.startswith("The camera moved at once, twice: from view 15 on, it is ")
     assert ", or the controller's tool is another one, by (" in words
+
+
+@pytest.mark.parametrize(
+    ("by", "share", "words"),
+    [
+        (-1, 0.006, "the image was taken before the arm had arrived, as of commanded poses"),
+        (-1, -0.01, "the pose was read before the arm had arrived"),
+        (1, 0.008, "the image was taken once the arm had left"),
+    ],
+)
+def test_an_arm_on_its_way_at_some_stops_is_named(by, share, words):
+    """At every third stop; a tool moves along lines, and turns about one axis."""
+    cell = simulate(CellOptions(seed=4, views=24, robot_sigma_m=2e-5, robot_sigma_rad=5e-5))
+    robot, stops = cell.robot.base_from_flange.copy(), np.arange(2, 23, 3)
+    here, there = cell.robot.base_from_flange[stops], cell.robot.base_from_flange[stops + by]
+    turns = Rotation.from_matrix(invert(here)[:, :3, :3] @ there[:, :3, :3]).as_rotvec()
+    # The picture is taken where the cell has the arm: what is logged is off that.
+    robot[stops, :3, :3] = here[:, :3, :3] @ Rotation.from_rotvec(-share * turns).as_matrix()
+    robot[stops, :3, 3] -= share * (there - here)[:, :3, 3]
+    verdict = calibrated(reporting(cell, base_from_flange=robot), joints=False).verdict
+    cause = verdict.causes[0]
+    assert cause.kind == "something_moved"
+    assert words in cause.words
+    assert {*cause.views} <= {*stops.tolist()}
+    # One stop in seven may stand beside a neighbour in the same place.
+    assert len(cause.views) >= len(stops) - 1
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ from visioncal.calibration.suspects.late_poses import by_joints
 from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.other_rows import of_other_rows
+from visioncal.calibration.suspects.outliers import IN_MOTION
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
@@ -91,10 +92,6 @@ _REAL_PART = Remedy(
 )
 # A number that stands still does so to a digit; others vary by more [mm, deg].
 _DIGIT_MM, _DIGIT_DEG, _VARIES_MM, _VARIES_DEG = 1e-3, 2e-3, 20.0, 5.0
-_IN_MOTION = Remedy(
-    "Wait until the arm stands still before each image, and log the measured pose then; or record "
-    "times of images and of a stream of poses (stamp_s, streams): then the delay is estimated."
-)
 # Views whose poses an option changes.
 _ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):")
 # Shares of the way to another stop that are tried.
@@ -394,7 +391,7 @@ def _on_the_way(robot: FloatArray, camera: FloatArray, kept: IntArray) -> Findin
         f"{figure(np.rad2deg(away))} deg (median of all pairs), as read to "
         f"{figure(np.rad2deg(none))} deg. So {when}."
     )
-    return Finding("misread_poses", words, _IN_MOTION)
+    return Finding("misread_poses", words, IN_MOTION)
 
 
 def turned_boards(run: RunState) -> Iterator[Finding]:

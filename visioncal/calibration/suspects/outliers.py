@@ -49,6 +49,13 @@ _MARGIN, _MARGINAL_SHARE = 1.5, 10
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
 # Another size turns nothing, and a small marker's noise less than so [rad].
 _TURNED_RAD = 0.2
+# Largest share of the way to another stop at which an arm is, and least share of outliers for which
+# that holds: one in hundreds is along that line by chance.
+_ON_THE_WAY, _MOST_ON_THE_WAY = 0.4, 0.6
+IN_MOTION = Remedy(
+    "Wait until the arm stands still before each image, and log the measured pose then; or record "
+    "times of images and of a stream of poses (stamp_s, streams): then the delay is estimated."
+)
 # Errors of an arm as a twist [rad].
 _ARM_LEAVES = float(np.hypot(1e-3 * _ARM_ERRS[0] / LEVER_M, np.deg2rad(_ARM_ERRS[1])))
 
@@ -122,7 +129,7 @@ def explained_outliers(
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
     if cell_fit.cell.mount is not None and not faults:
-        faults += _moved_run(cell_fit)
+        faults += [*_in_motion(cell_fit, outliers)] or _moved_run(cell_fit)
     if cell_fit.cell.mount is None and not faults:
         faults += [*_misnamed(cell_fit, outliers)] or _pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
@@ -138,6 +145,60 @@ def _fault(
     words = words.format(views=view_words(views))
     found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
     return PoseFault(found, tuple(rows), short)
+
+
+def _in_motion(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
+    """Outliers at which the arm was on its way from the last stop, or to the next one."""
+    inliers, part = cell_fit.inlier_fit, cell_fit.inlier_fit.problem
+    (poses, *others), stops = part.poses.values(), part.observations.stops[outliers]
+    known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+    linear = part.linear(inliers.fit.state)
+    noise = part.total_covariance(linear, inliers.fit.noise)[outliers]
+    if others or len(outliers) < FEWEST_VIEWS or not noise.any():
+        return
+    residuals, by_flange = linear.residuals[outliers], linear.by_flanges[outliers]
+    at, found = np.searchsorted(known, stops), list[tuple[int, bool, IntArray, FloatArray]]()
+    for by in (-1, 1):
+        other = known[np.clip(at + by, 0, len(known) - 1)]
+        ways = log(invert(poses[stops]) @ poses[other])
+        # Most programs have a tool move along a line.
+        ways[:, 3:] = np.einsum(
+            "nji,nj->ni", poses[stops][:, :3, :3], poses[other][:, :3, 3] - poses[stops][:, :3, 3]
+        )
+        moved = (by_flange @ ways[:, :, None])[:, :, 0]
+        white = np.linalg.solve(noise, np.stack([residuals, moved], axis=2))
+        before, cross, square = (
+            np.einsum("ni,ni->n", *pair)
+            for pair in (
+                (residuals, white[:, :, 0]),
+                (moved, white[:, :, 0]),
+                (moved, white[:, :, 1]),
+            )
+        )
+        shares = -cross / np.maximum(square, np.finfo(float).tiny)
+        left = before - shares**2 * square
+        explained = (CLEAR_RATIO**2 * left < before) & (np.abs(shares) < _ON_THE_WAY)
+        for is_beyond in (False, True):
+            rows = np.flatnonzero(explained & ((shares < 0.0) == is_beyond))
+            found.append((by, is_beyond, rows, np.abs(shares[rows])))
+    by, is_beyond, rows, shares = max(found, key=lambda item: len(item[2]))
+    if len(rows) < max(FEWEST_VIEWS, _MOST_ON_THE_WAY * len(outliers)):
+        return
+    which = "last" if by < 0 else "next"
+    when = {
+        (
+            -1,
+            False,
+        ): "the image was taken before the arm had arrived, as of commanded poses",
+        (-1, True): "the pose was read before the arm had arrived",
+        (1, False): "the image was taken once the arm had left",
+        (1, True): "the pose was read once the arm had left",
+    }[by, is_beyond]
+    low, high = (figure(100.0 * float(share)) for share in (shares.min(), shares.max()))
+    how = f"by {low} to {high} % of the way to the {which} stop"
+    short = f"the arm moved between image and pose, {how}"
+    words = f"{{views}} were left out: {short}, along the line between both: {when}."
+    yield _fault(cell_fit, "something_moved", outliers[rows].tolist(), words, IN_MOTION, short)
 
 
 def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
