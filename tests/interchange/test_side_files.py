@@ -328,3 +328,130 @@ def test_the_length_of_a_grid_of_circles_is_that_of_its_rows(tmp_path):
     assert "Measure the distance from one row of circles to the next" in said
     assert "half of that between circles of a row" in said
     assert "side of a square" not in said
+
+
+def a_calibrated_pair(count: int, seed=1):
+    """The robot's poses (n, 4, 4) and a camera's of a target on the flange [mm]."""
+    robot, (base, tool) = matrices(count, seed), matrices(2, seed + 1)
+    for pose in (robot, base, tool):
+        pose[..., :3, 3] *= 1e3
+    return robot, np.linalg.inv(base) @ robot @ tool
+
+
+@pytest.mark.parametrize("by_point", [False, True])
+def test_several_points_that_a_camera_saw_at_each_pose_are_the_target_s(tmp_path, by_point):
+    robot, seen = a_calibrated_pair(10)
+    shape = np.array([[0, 0, 0], [90, 0, 0], [10, 60, 0], [20, 20, 40.0]])
+    places = np.einsum("nij,kj->nki", seen[:, :3, :3], shape) + seen[:, None, :3, 3]
+    rows = (np.swapaxes(places, 0, 1) if by_point else places).reshape(-1, 3)
+    turns = Rotation.from_matrix(robot[:, :3, :3]).as_rotvec()
+    arrays = {"pose_arm_N": np.hstack([robot[:, :3, 3], turns]), "P_C_N": rows}
+    savemat(tmp_path / "in.mat", arrays)
+    said = ("--mount", "eye-to-hand", "--robot-form", "rotation-vector")
+    done = visioncal("convert", tmp_path / "in.mat", tmp_path / "out", *said).good()
+    assert "P_C_N has 4 points" in done.err
+    views = Session.load(tmp_path / "out").views
+    found = np.array([view.cam_from_target().as_matrix() for view in views])
+    # Whatever frame the points are given, its motions are the target's.
+    moved, true = (each @ np.linalg.inv(each[0]) for each in (found, seen))
+    true[:, :3, 3] *= 1e-3
+    np.testing.assert_allclose(moved, true, atol=1e-9)
+
+
+def test_points_on_a_line_are_no_pose(tmp_path):
+    robot, seen = a_calibrated_pair(10)
+    shape = np.array([[0, 0, 0], [40, 0, 0], [90.0, 0, 0]])
+    places = np.einsum("nij,kj->nki", seen[:, :3, :3], shape) + seen[:, None, :3, 3]
+    turns = Rotation.from_matrix(robot[:, :3, :3]).as_rotvec()
+    arrays = {"pose_arm": np.hstack([robot[:, :3, 3], turns]), "seen": places.reshape(-1, 3)}
+    savemat(tmp_path / "in.mat", arrays)
+    said = ("--mount", "eye-to-hand", "--robot-form", "rotation-vector")
+    said = visioncal("convert", tmp_path / "in.mat", tmp_path / "out", *said).refused().err
+    assert "nothing says what a camera saw" in said
+
+
+def opencv_rows(path: Path, **series: np.ndarray) -> None:
+    """Matrices by numbered names, as OpenCV writes them."""
+    lines = ["%YAML:1.0", "---"]
+    for name, arrays in series.items():
+        for at, array in enumerate(arrays, 1):
+            rows, columns = np.atleast_2d(array).shape
+            numbers = ", ".join(map(repr, np.ravel(array).tolist()))
+            lines += [f"{name}{at:02d}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}"]
+            lines += ["   dt: d", f"   data: [ {numbers} ]"]
+    write(path, "\n".join(lines) + "\n")
+
+
+def test_no_pose_is_proposed_of_files_that_do_not_belong_together(tmp_path):
+    robot, seen = a_calibrated_pair(19)
+    more = matrices(30, 5)
+    places, turns = seen[:16, :3, 3], Rotation.from_matrix(seen[:16, :3, :3]).as_rotvec()
+    opencv_rows(tmp_path / "in/handEye.yml", Matrix=robot)
+    opencv_rows(tmp_path / "in/TranslationVectors.yml", TranslationVectors=places)
+    opencv_rows(tmp_path / "in/RotationVectors.yml", RotationVectors=turns)
+    others = Rotation.from_matrix(more[:, :3, :3]).as_rotvec()
+    opencv_rows(
+        tmp_path / "in/Vectors.yml", TranslationVectors=more[:, :3, 3], RotationVectors=others
+    )
+    said = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    said = said.refused().err
+    assert "TranslationVectors.TranslationVectors,Vectors.RotationVectors" not in said
+    assert "Both sides need a row each: handEye.Matrix has 19 poses" in said
+    assert "(16)" in said
+    assert "(30)" in said
+
+
+def test_poses_in_round_brackets_with_dates_are_the_robot_s_and_checks_are_not(tmp_path):
+    poses = matrices(18)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    lines = [
+        f"p({', '.join(map(repr, row))})     2017-12-18 10:28:{at + 10}"
+        for at, row in enumerate(np.hstack([poses[:, :3, 3], turns]).tolist())
+    ]
+    write(tmp_path / "in/robot_pose.txt", "\n".join(lines) + "\n")
+    opencv_rows(
+        tmp_path / "in/VerifyPose.yml", verify_pose_=np.hstack([poses[:5, :3, 3], turns[:5]])
+    )
+    said = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    said = said.refused().err
+    assert "18 poses of the robot" in said
+    fields = read_fields(tmp_path / "in/robot_pose.txt")
+    np.testing.assert_allclose(fields.column("x")[:, 0], poses[:, 0, 3])
+
+
+def test_broken_rotations_are_called_so(tmp_path):
+    """Nine elements of one name that begin with w of a quaternion."""
+    rng = np.random.default_rng(1)
+    for side in ("stylus", "camera"):
+        text = ""
+        for place in rng.uniform(100, 400, (12, 3)):
+            axes = "".join(f"<{a}>{v!r}</{a}>" for a, v in zip("xyz", place.tolist(), strict=True))
+            w, x, y = rng.uniform(-0.6, 0.6, 3).tolist()
+            cells = "".join(f"<Element>{v!r}</Element>" for v in (w, x, y, w, y, 0.7, w, x, -0.3))
+            text += f"<Capture><Position>{axes}</Position><Rotation>{cells}</Rotation></Capture>"
+        write(tmp_path / f"in/{side}_captures.xml", f"<?xml version='1.0'?><All>{text}</All>")
+    said = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    said = said.refused().err
+    assert "stylus_captures.Rotation.Element are called rotations, and are none" in said
+    assert "Record the robot's rotations" not in said
+
+
+def test_a_folder_of_pose_pairs_has_no_pictures(tmp_path):
+    robot, seen = a_calibrated_pair(9)
+    (tmp_path / "in").mkdir()
+    np.savez(tmp_path / "in/pairs.npz", robot=robot, camera=seen)
+    said = visioncal("calibrate", tmp_path / "in", "-o", tmp_path / "out").refused().err
+    assert "A folder's poses of robot and target become a session" in said
+    np.savez(tmp_path / "in/pictures.npz", images=np.zeros((9, 400, 600), np.uint8))
+    said = visioncal("calibrate", tmp_path / "in", "-o", tmp_path / "out").refused().err
+    assert "A folder's pictures and poses become a session" in said
+
+
+def test_depth_in_floats_is_in_metres(tmp_path):
+    shoot(tmp_path / "in", "rgb_{}.png", 5)
+    rows = [{"image": f"rgb_{at}.png", "T": p.tolist()} for at, p in enumerate(matrices(5), 1)]
+    write(tmp_path / "in/poses.json", rows)
+    for at in range(1, 6):
+        cv2.imwrite(str(tmp_path / f"in/depth_{at}.tiff"), np.full((72, 128), 0.9, np.float32))
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *BOARD).good()
+    assert "it is the views' depth, in metres unless" in done.err

@@ -48,6 +48,18 @@ def session_text(path: Path) -> str:
         raise DataError(message, culprits=error.culprits, next_step=step) from error
 
 
+# Arrays of so many bytes together may be pictures; poses take some thousands.
+_PICTURES_BYTES = 1_000_000
+
+
+def _may_hold_images(folder: Path, endings: set[str]) -> bool:
+    """Whether files of other kinds may hold pictures: recordings, or arrays of many bytes."""
+    others = endings & {*_HOLDING_IMAGES}
+    arrays = [file for file in islice(folder.rglob("*.npz"), 999) if file.is_file()]
+    size = sum(file.stat().st_size for file in arrays)
+    return bool(others - {".npz"}) or size > _PICTURES_BYTES
+
+
 def _conversion_of(path: Path) -> str:
     """Advice for pictures and poses that are no session yet: a folder of both, or either alone."""
     named = path.parent if path.suffix.lower() in IMAGE_ENDINGS else path
@@ -61,7 +73,7 @@ def _conversion_of(path: Path) -> str:
     elif endings and endings.issubset(IMAGE_ENDINGS):
         what, images = "A folder of pictures and a table of their poses", f" --images {source}"
         source = "TABLE"
-    elif endings and endings.isdisjoint((*IMAGE_ENDINGS, *_HOLDING_IMAGES)):
+    elif endings and endings.isdisjoint(IMAGE_ENDINGS) and not _may_hold_images(named, endings):
         what, board = "A folder's poses of robot and target", ""
     return (
         f"{what} become a session by the camera's mount (eye-to-hand where it is fixed){board}. "

@@ -48,7 +48,7 @@ _SIGNS = str.maketrans(
 )
 # Notations around the numbers of a pose, with their forms.
 _MARKED = (
-    ("ur", re.compile(r"(?<!\w)p\s*\[([^\[\]]*)\]")),
+    ("ur", re.compile(r"(?<!\w)p\s*(?:\[(?=[^\[\]]*\])|\((?=[^()]*\)))([^\[\]()]*)[\])]")),
     ("doosan", re.compile(r"(?<!\w)posx\s*\(([^()]*)\)")),
     ("abb", re.compile(r"\[\s*\[([^\[\]]*\]\s*,\s*\[[^\[\]]*)\]")),
 )

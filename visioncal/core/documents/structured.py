@@ -215,8 +215,12 @@ def _tag(element: Element) -> str:
 
 
 def _texts(element: Element) -> object:
-    """The text of an element, or those in it and its attributes by name."""
-    values = {**element.attrib, **{_tag(child): _texts(child) for child in _parts(element)}}
+    """The text of an element, or texts in it and attributes by name, several alike as a list."""
+    found: dict[str, list[object]] = {}
+    for child in _parts(element):
+        found.setdefault(_tag(child), []).append(_texts(child))
+    texts = {tag: each[0] if len(each) == 1 else each for tag, each in found.items()}
+    values: dict[str, object] = {**element.attrib, **texts}
     text = (element.text or "").strip()
     return values | ({_tag(element): text} if text else {}) if values else text
 

@@ -166,7 +166,9 @@ def with_depth(pairing: Pairing, groups: Sequence[FileGroup]) -> Pairing:
             continue
         of = dict(zip(images, group.taken(found.rows), strict=True))
         depths = tuple(file and of[file] for file in pairing.images)
-        unit = ", in millimetres unless [camera] depth_unit_m says otherwise"
+        is_float = group.image is not None and group.image.words.startswith("32")
+        unit = f", in {'metres' if is_float else 'millimetres'} unless [camera] depth_unit_m says "
+        unit += "otherwise"
         notes.append(
             f"The depth {group.listed()} is of the same images: it is the views' depth"
             f"{'' if group.is_clouds else unit}."

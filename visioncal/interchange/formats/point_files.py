@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.number_format import counted, some_of
-from visioncal.core.types import FloatArray
+from visioncal.core.procrustes import align
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.fields import Fields, joined
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.point_tables import PointTable
@@ -118,14 +119,27 @@ def together(tables: Sequence[PointTable], count: int) -> tuple[PointTable, tupl
 def in_turn(points: PointTable, count: int) -> tuple[list[object], list[str], str] | None:
     """Stops and points of rows without names, several times as many as the robot's stops; and how.
 
+    None where their distances do not say which they are.
+    """
+    found = None if _is_named(points) else _in_order(_places(points), count)
+    if found is None:
+        return None
+    how, stops, spots = found
+    several = len(points.fields) // count
+    note = f"{several} points are taken {how} of the robot: so they keep their distances."
+    return list[object](stops.tolist()), [str(spot + 1) for spot in spots], note
+
+
+def _in_order(places: FloatArray, count: int) -> tuple[str, IntArray, IntArray] | None:
+    """How (n, 3) places are several at each of `count` stops, and the stop and point of each.
+
     Points at a stop follow one another, or stops of a point: distances that stay say which. None
     where neither is clear.
     """
-    rows = len(points.fields)
-    if rows % count or rows == count or _is_named(points):
+    rows = len(places)
+    if rows % count or rows == count:
         return None
-    several, places = rows // count, _places(points)
-    at = np.arange(rows)
+    several, at = rows // count, np.arange(rows)
     orders = {
         "in turn at each stop": (at // several, at % several),
         "one after the other, each at all stops": (at % count, at // count),
@@ -137,10 +151,44 @@ def in_turn(points: PointTable, count: int) -> tuple[list[object], list[str], st
     best, other = sorted(orders, key=changes.__getitem__)
     if not changes[best] < min(_RIGID, changes[other] / _CLEARLY):
         return None
-    stops, spots = orders[best]
-    keys = list[object](stops.tolist())
-    note = f"{several} points are taken {best} of the robot: so they keep their distances."
-    return keys, [str(spot + 1) for spot in spots], note
+    return best, *orders[best]
+
+
+# Fewest points whose places are a pose, and the least share of their extent off a line.
+_OF_A_POSE, _OFF_LINE = 3, 0.05
+
+
+def with_point_sets(fields: Fields, others: Sequence[Fields]) -> Fields:
+    """Rows of the robot's poses with the target's, where other rows are points of it at each.
+
+    Three points and more that keep their distances, and lie on no line, have a pose: that of the
+    points at the first stop, from their mean.
+    """
+    count, found = len(fields), dict[str, tuple[FloatArray, str]]()
+    for other in others if len(possible_poses(fields)) == 1 else ():
+        order = None
+        if _three(other) and len(other) >= _OF_A_POSE * count > 0:
+            name = other.name if len(other.numbers) > 1 else next(iter(other.numbers))
+            places = np.hstack([other.column(each) for each in other.numbers])
+            order = _in_order(places, count) if np.isfinite(places).all() else None
+        if order is not None:
+            how, stops, spots = order
+            sets = places[np.lexsort((spots, stops))].reshape(count, -1, 3)
+            found[name] = sets, how
+    if len(found) != 1:
+        return fields
+    name, (sets, how) = found.popitem()
+    shape = sets[0] - sets[0].mean(axis=0)
+    extents = np.linalg.svd(shape, compute_uv=False)
+    if extents[1] < _OFF_LINE * extents[0]:
+        return fields
+    poses = align(sets, np.broadcast_to(shape, sets.shape))
+    note = (
+        f"{name} has {sets.shape[1]} points {how} of the robot, as they keep their distances: "
+        "fitted to these of the first, they are poses of the target."
+    )
+    named = {f"camera.{name.rpartition('.')[2]}": poses}
+    return replace(fields, numbers={**fields.numbers, **named}, notes=(*fields.notes, note))
 
 
 def _is_named(table: PointTable) -> bool:

@@ -173,6 +173,10 @@ def possible_poses(
     for place in places:
         is_named = bool(_POSITION_WORDS & {*place.words})
         alike = [turn for turn in turns if is_named and turn.rest == place.rest]
+        # Of another file, rows without one have none of the other.
+        alike = [turn for turn in alike if turn.parent == place.parent] or [
+            turn for turn in alike if _are_of_same_rows(fields, place.names[0], turn.names[0])
+        ]
         rest = (turn for turn in turns if turn.parent == place.parent and turn.rest not in rests)
         alike = alike or [*rest]
         if alike:
@@ -187,6 +191,12 @@ def possible_poses(
             complete.setdefault(item.names, item)
     items = sorted(complete.values(), key=lambda item: not item.is_named)
     return _called(_of_trackers(items, taken), is_single=not taken)
+
+
+def _are_of_same_rows(fields: Fields, one: str, other: str) -> bool:
+    """Whether two fields have numbers in the same rows."""
+    first, second = (np.isfinite(fields.column(name)).all(axis=1) for name in (one, other))
+    return bool(np.array_equal(first, second))
 
 
 def _of_trackers(items: list[PoseFields], taken: Collection[str]) -> list[PoseFields]:

@@ -37,13 +37,16 @@ from visioncal.interchange.formats.intrinsics import (
 )
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.keys import HOW
+from visioncal.interchange.formats.point_files import with_point_sets
 from visioncal.interchange.formats.poses import (
+    PoseFields,
     column_groups,
     columns_named,
     pose_names,
     possible_poses,
     ranked_poses,
     without_copies,
+    words_of,
 )
 from visioncal.interchange.formats.reading import DOCUMENTS, read_record, read_rows
 from visioncal.robot import Robot
@@ -271,11 +274,14 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     is_seen = bool(source.images or requested.images)
     found: list[tuple[int, Fields, ImportOptions]] = []
     rows = rows_in(source)
+    of_robot = [len(fields) for fields in rows if _is_of_robot(fields)]
     for fields in [each for each in rows if _has(each, given)] or rows:
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
         # A result of another program has a row or two.
         later += 8 * (len(fields) < FEWEST_ROWS)
+        # A list of a few poses beside many of the robot's is of checks.
+        later += 8 * (2 * len(fields) < max(of_robot, default=0))
         asked = _with_joints(fields, requested)
         joints = asked.joints or joint_names(fields, ())
         is_given = bool(requested.robot.names) or not _has(fields, given)
@@ -302,6 +308,13 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     if not found:
         raise unknown(source, requested, rows)
     return sorted(found, key=lambda item: item[0])[:_MOST_READINGS]
+
+
+def _is_of_robot(fields: Fields) -> bool:
+    """Whether the names of poses, or that of their file, say that they are the robot's."""
+    items = possible_poses(fields)
+    file = PoseFields((), tuple(words_of(fields.name)))
+    return bool(items) and any(item.sides == ["robot"] for item in (*items, file))
 
 
 def _with_joints(fields: Fields, requested: ImportOptions) -> ImportOptions:
@@ -379,14 +392,25 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         own = {*robot.names}
         others = [each for of, each in possible[1:] if of is fields and not own & {*each.names}]
         others = [item for item in others if item.sides != ["robot"]]
-        others = [item for item in others if item.sides] or others * (not source.images)
         # Both sides of a recording have as many poses; a file with more is of other pictures.
-        counts = {each.name: len(each) for part in source.parts for each in part.rows}
-        others.sort(key=lambda item: counts.get(item.names[0].partition(".")[0], 0) > len(fields))
+        lengths = {each.name: len(each) for part in source.parts for each in part.rows}
+        filled = _filled(fields, robot, {})
+        uneven = [item for item in others if _filled(fields, item, lengths) != filled]
+        others = [item for item in others if item not in uneven]
+        others = [item for item in others if item.sides] or others * (not source.images)
         for whose, item in zip(("robot", "camera"), (robot, *others[:1]), strict=False):
             options += [f"--{whose}-{named_by(fields.places[0])}", ",".join(item.names)]
         step = _of_one_file(source, requested, robot.names)
-        if not step:
+        if not step and uneven and not (others or source.images):
+            counts = [
+                f"{','.join(item.names)} ({_filled(fields, item, lengths)})" for item in uneven
+            ]
+            step = (
+                f"Both sides need a row each: {','.join(robot.names)} has {filled} poses, and "
+                f"there are {some_of(counts)}. Name the files of one recording, the robot's as the "
+                "source and the camera's with --camera-file."
+            )
+        elif not step:
             step = f"Say {' '.join(options)}, where these are its poses"
             step += f":\n{shlex.join([*requested.command, *options])}" if requested.command else "."
     elif rows:
@@ -400,6 +424,13 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         or "Write the poses into a CSV with a header, one row per view. Lists in a .py or .cpp "
         "program are read where it is named as the source.",
     )
+
+
+def _filled(fields: Fields, item: PoseFields, lengths: Mapping[str, int]) -> int:
+    """The number of rows that have all numbers of a pose, or of its file where these are more."""
+    columns = np.hstack([fields.column(name) for name in item.names])
+    length = lengths.get(item.names[0].partition(".")[0], 0)
+    return max(int(np.isfinite(columns).all(axis=1).sum()), length * (length > len(fields)))
 
 
 def _of_one_file(source: Source, requested: ImportOptions, names: Sequence[str]) -> str:
@@ -453,6 +484,8 @@ def rows_in(source: Source) -> list[Fields]:
         prefixed=True,
     )
     named = [replace(f, name=source.path.resolve().name) if f.stems else f for f in found]
+    if not source.images:
+        named = [with_point_sets(f, [other for other in named if other is not f]) for f in named]
     # Joint angles of as many rows or more say where the arm stood, too, where there are pictures.
     most = max((len(fields) for fields in named if possible_poses(fields)), default=0)
     return [

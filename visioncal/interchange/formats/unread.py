@@ -1,6 +1,7 @@
 """Content of a source beside poses: pictures in arrays, other series, points."""
 
 import json
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from visioncal.core.number_format import counted, some_of
 from visioncal.core.procrustes import align, spreads
 from visioncal.core.transforms import apply, rotation_angle
 from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.fields import Fields, unit_by_size, without_unit
+from visioncal.interchange.formats.fields import Fields, appearance, unit_by_size, without_unit
 from visioncal.interchange.formats.file_search import DRAWN, FileGroup
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions
 from visioncal.interchange.formats.poses import PoseFields, points_in, possible_poses
@@ -26,6 +27,8 @@ from visioncal.interchange.formats.sources import Source, rows_in
 # Fewest pairs of points, and the largest residual of a rigid motion that maps one side's to the
 # other's, as a share of their least extents in a plane (rms): numbers of poses leave about all.
 _FEWEST_POINTS, _MOST_RESIDUAL = 4, 0.1
+
+_ROTATION = re.compile("rot|orient|quat", re.IGNORECASE)
 
 # Writes the pictures of .npz files to a folder, and beside them what else they hold.
 _UNPACK = """\
@@ -227,9 +230,29 @@ def points_beside(fields: Fields, robot: tuple[str, ...]) -> tuple[str, ...]:
     return found[0] if len(found) == 1 else ()
 
 
+def _broken_rotations(source: Source) -> list[str]:
+    """Fields whose names say rotations, of as many numbers as these, that are none."""
+    return [
+        name
+        for fields in rows_in(source)
+        for name, numbers in fields.numbers.items()
+        if len(numbers) and numbers[0].size in (4, 9) and _ROTATION.search(name)
+        if not appearance(numbers)
+    ]
+
+
 def check_points(source: Source) -> None:
     """Raises DataError where a source has pairs of points without rotations."""
     if pairs := point_pairs(source):
+        if broken := _broken_rotations(source):
+            raise DataError(
+                f"{source.path.name}: {some_of(broken)} are called rotations, and are none: their "
+                "numbers are no orthonormal matrix and no unit quaternion. A calibration takes the "
+                "rotations of both sides.",
+                culprits=broken,
+                next_step="Correct the program that writes them: a matrix by rows, whose rows have "
+                "length 1 and are perpendicular, or qx, qy, qz, qw of length 1; then record again.",
+            )
         robot, camera = pairs.names
         where = shlex.quote(str(source.path))
         fit = f"maps one to the other but for {1e3 * pairs.rms_m:.3g} mm (rms)"
