@@ -271,7 +271,9 @@ DONE_WRONG = {
     "a table for the session": (nothing, calibrate("cell/views.csv"), 0, "good"),
     "the folder of the images": (nothing, calibrate("cell/images"), 0, "good"),
     "the folder above": (nothing, calibrate("."), 0, "good"),
-    "no session.toml": (lambda it: (it / "session.toml").unlink(), CELL, 0, "good"),
+    "no session.toml": (
+        lambda it: (it / "session.toml").unlink(), CELL, 0, "wrote cell-session",
+    ),
     "no views.csv": (lambda it: (it / "views.csv").unlink(), CELL, 2, "views.csv does not exist"),
     "no images": (lambda it: shutil.rmtree(it / "images"), CELL, 2, "Copy them there"),
     "half of the images": (half_copied, CELL, 0, "Only 8 views"),
@@ -305,7 +307,7 @@ DONE_WRONG = {
         text("qx,qy,qz,qw", "qw,qx,qy,qz", "views.csv"), CELL, 0, "good",
     ),
     "columns exchanged": (
-        cells(lambda _, row: row | {"x_m": row["y_m"], "y_m": row["x_m"]}), CELL, 3, "bad",
+        cells(lambda _, row: row | {"x_m": row["y_m"], "y_m": row["x_m"]}), CELL, 0, "good",
     ),
     "Windows' line ends and marks": (as_windows_has_it, CELL, 0, "good"),
     "tabs": (text(",", "\t", "views.csv"), CELL, 0, "good"),

@@ -208,11 +208,14 @@ def _do(
         last = call
         ended = _called(run, call)
         allowed = (0, 2, 3) if call[0] in (*_JUDGES, current[0]) else (0,)
+        if call[0] == "convert" and ended.status == 2:
+            # It asks for what no file states; the rest of the line would not be run.
+            return tuple(call), ended
         assert ended.status in allowed, trail.told(f"{advice.command}: {ended.status} {ended.said}")
     is_judged = ended is not None and last[0] in (*_JUDGES, current[0])
     edited = advice.is_edit and _edit(advice.words, _folder(current), trail)
     if edited or not is_judged:
-        if not (advice.calls or edited):
+        if not (advice.calls or edited) or "which this makes" in advice.words:
             current = _typed(advice.words, current, trail)
         return current, None
     return tuple(last), ended
