@@ -308,17 +308,28 @@ def _mounted(flanges: FloatArray, read: FloatArray) -> FloatArray:
     by_matrix = np.einsum("ij,...k->...ijk", np.eye(3), read).reshape(*turned.shape[:-1], 9)
     flat = (*flanges.shape[:-3], -1)
     design = np.concatenate([by_matrix, eye, -turned], axis=-1).reshape(*flat, 15)
-    linear = (np.linalg.pinv(design) @ places.reshape(*flat, 1))[..., :9, 0]
+    linear = _least_squares(design, places.reshape(*flat, 1))[..., :9]
     rotation = nearest_rotation(linear.reshape(*linear.shape[:-1], 3, 3))
     values = np.zeros((*linear.shape[:-1], 9))
     for _ in range(_STEPS):
         pointed = read @ np.swapaxes(rotation, -1, -2)
         design = np.concatenate([-skew(pointed), eye, -turned], axis=-1).reshape(*flat, 9)
-        values = (np.linalg.pinv(design) @ (places - pointed).reshape(*flat, 1))[..., 0]
+        values = _least_squares(design, (places - pointed).reshape(*flat, 1))
         turn = np.concatenate([values[..., :3], np.zeros_like(values[..., :3])], axis=-1)
         rotation = exp(turn)[..., :3, :3] @ rotation
     x = compose(np.broadcast_to(np.eye(3), rotation.shape), values[..., 6:])
     return np.stack([x, compose(rotation, values[..., 3:6])], axis=-3)
+
+
+def _least_squares(design: FloatArray, right: FloatArray) -> FloatArray:
+    """(..., q) solutions of (..., n, q) equations; what these leave open is zero.
+
+    By the normal equations: singular values under 1e-6 of the largest, which are of directions that
+    millions of readings would determine no better, count as none.
+    """
+    across = np.swapaxes(design, -1, -2)
+    inverse = np.linalg.pinv(across @ design, rcond=1e-12, hermitian=True)
+    return np.asarray((inverse @ (across @ right))[..., 0])
 
 
 def _missed(flanges: FloatArray, read: FloatArray, edges: FloatArray) -> FloatArray:

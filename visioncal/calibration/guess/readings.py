@@ -18,6 +18,8 @@ _MIRROR = np.array([1.0, -1.0, 1.0])
 _UNITS = tuple(unit for unit in UNITS_M if unit != "um")
 # Radians that were read as degrees leave all rotations within 2 pi degrees of identity, per angle.
 _RADIANS_AS_DEGREES_RAD = np.deg2rad(12.0)
+# Weights of the numbers of a rotation, in a sum that tells rotations apart.
+_UNEVEN = np.sqrt(np.array([[2.0, 3.0, 5.0], [7.0, 11.0, 13.0], [17.0, 19.0, 23.0]]))
 _GON = 0.9  # Degrees of a gon, of which 400 are a turn.
 
 
@@ -314,13 +316,13 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
     if not by_makers and turned.max(initial=0.0) < _RADIANS_AS_DEGREES_RAD:
         radians = [name.replace("-deg", "-rad") for name in degrees]
         pairs += [*product(radians, degrees), ("rotation-vector", "rotation-vector-deg")]
-    known, of_form = [rotations], cache(partial(as_written, robot))
+    known, of_form = _Known(), cache(partial(as_written, robot))
+    known.adds(rotations)
     yield from _signed_angles(robot, known, [f"euler-{order}-deg" for order in used])
     for name, written in pairs:
         tried = SideReading(name).rotations(of_form(written))
         # Other names of the same numbers in another order are the same mistake.
-        if not any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
-            known.append(tried)
+        if known.adds(tried):
             words = (
                 f"the robot's rotations as {ROTATION_FORMS[name].words}, which were taken for "
                 f"{ROTATION_FORMS[written].words}"
@@ -332,6 +334,24 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
                 yield Change(words, "robot", fields, 2)
 
 
+class _Known:
+    """Rotations that were tried; hundreds are compared, most of which differ in their sums."""
+
+    def __init__(self) -> None:
+        self._rotations = list[FloatArray]()
+        self._sums = list[float]()
+
+    def adds(self, tried: FloatArray) -> bool:
+        """Whether (n, 3, 3) rotations are none of these yet, which from then on they are."""
+        own = float(np.nansum(tried * _UNEVEN))
+        near = np.flatnonzero(np.abs(np.array(self._sums) - own) <= 5e-4 * max(len(tried), 1))
+        if any(np.allclose(tried, self._rotations[at], atol=1e-9, equal_nan=True) for at in near):
+            return False
+        self._rotations.append(tried)
+        self._sums.append(own)
+        return True
+
+
 def _other_angles(angles: FloatArray, form: str) -> FloatArray:
     """The other (n, 3) Euler angles, in a form of these, of the same rotations."""
     _, order, unit = form.split("-")
@@ -341,9 +361,7 @@ def _other_angles(angles: FloatArray, form: str) -> FloatArray:
     return np.asarray(other)
 
 
-def _signed_angles(
-    robot: PoseNumbers, known: list[FloatArray], forms: Sequence[str]
-) -> Iterator[Change]:
+def _signed_angles(robot: PoseNumbers, known: "_Known", forms: Sequence[str]) -> Iterator[Change]:
     """Rotations made of Euler angles in gon, or with one of another sign, which is then known."""
     for form in forms:
         words = f"the robot's {ROTATION_FORMS[form].words}, but in gon (400 to a turn)"
@@ -354,8 +372,7 @@ def _signed_angles(
         if cost > 1:
             continue
         tried = SideReading(form, terms=terms).rotations(as_written(robot, form))
-        if any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
+        if not known.adds(tried):
             continue
-        known.append(tried)
         words = f"another sign of the {named} of the robot's {ROTATION_FORMS[form].words}"
         yield Change(words, "robot", {"rotation": form, "written": form, "terms": terms}, 2)
