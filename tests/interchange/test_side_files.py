@@ -1,6 +1,7 @@
 """Folders of a recording with other files beside it: each is read as the recording that it is."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -213,6 +214,9 @@ def test_points_of_several_files_are_read_together_and_others_are_named(tmp_path
     for at in range(3):
         np.savetxt(tmp_path / f"in/position_SMR_{at + 1}.txt", places[:, at])
     np.savetxt(tmp_path / "in/position_SMR_base.txt", places[:3, 0] + 300)
+    # A copy of all is no further points, either.
+    shutil.copytree(tmp_path / "in", tmp_path / "in/copy")
+    (tmp_path / "in/copy/joints_tool.txt").unlink()
     # A drawing of one of them is no further point.
     rng = np.random.default_rng(2)
     np.savetxt(tmp_path / "in/position_nominal.txt", places[:, 0] + rng.normal(0, 1, (10, 3)))

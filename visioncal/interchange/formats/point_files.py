@@ -81,12 +81,13 @@ def together(tables: Sequence[PointTable], count: int) -> tuple[PointTable, tupl
     Points of one flange keep their distances. `count` is that of the stops.
     """
     first, *others = tables
-    own = _places(first)
     names = [*first.points().values()]
     alike = [first]
     for table in others if len(first.fields) == count and not _is_named(first) else ():
         fits = len(table.fields) == count and not _is_named(table)
-        if fits and [*table.points().values()] == names and _are_rigid(own, _places(table)):
+        fits = fits and [*table.points().values()] == names
+        # Of a copy in another folder, one of the points has no distance.
+        if fits and all(_are_rigid(_places(each), _places(table)) for each in alike):
             alike.append(table)
     left = [f"{t.file} ({counted(len(t.fields), 'row')})" for t in others if t not in alike]
     notes = (
