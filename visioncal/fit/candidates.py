@@ -162,10 +162,14 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 
 
 def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
-    """Candidates that differ from stop to stop."""
+    """Candidates that differ from stop to stop, or before and after one.
+
+    An image that is shifted at once shows in nothing that varies.
+    """
     yield from of_arms(fit, pairs)
     jitters = [one for one in effects_of_lenses(fit) if isinstance(one, FocusJitter)]
-    yield from beside_zooms(fit, scored(fit, jitters))
+    free = [name for name in fit.unknowns.lenses if ("lens", name) in fit.unknowns]
+    yield from beside_zooms(fit, scored(fit, jitters), free if sole_flange(fit) else ())
 
 
 def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
@@ -377,9 +381,19 @@ def steps(fit: Fit, flange: str, place: tuple[float, ...]) -> Iterator[Effect]:
             yield JointsStep(flange, arm.model, float(progress[at]))
 
 
-def beside_zooms(fit: Fit, changes: Iterable[Candidate]) -> Iterator[Candidate]:
-    """Candidates that change a lens, and beside clear ones that it changed at once."""
-    clear, grown, alone = set[str](), dict[str, float](), dict[str, Candidate]()
+def moved_instead(fit: Fit, zoom: LensSteps) -> Iterator[Effect]:
+    """Moves at the stop at which a lens changed: of what the only arm carries, and of its base."""
+    progress = float(fit.cell.moments.progress[zoom.stop - 1])
+    if flange := sole_flange(fit):
+        yield BaseSteps(flange, _beside(fit, flange), progress)
+        yield MountSteps(flange, progress)
+
+
+def beside_zooms(
+    fit: Fit, changes: Iterable[Candidate], cameras: Iterable[str] = ()
+) -> Iterator[Candidate]:
+    """Candidates that change a lens, and that it changed at once beside clear ones, or anyway."""
+    clear, grown, alone = set(cameras), dict[str, float](), dict[str, Candidate]()
     for one in changes:
         yield one
         if 2.0 * one.gain >= SIGNIFICANT and one.lens:
@@ -392,19 +406,22 @@ def beside_zooms(fit: Fit, changes: Iterable[Candidate]) -> Iterator[Candidate]:
                 alone[one.name] = max(one, alone.get(one.name, one), key=lambda at: at.gain)
     likeliest = [one.effect for one in alone.values() if one.effect is not None]
     for one in scored(fit, likeliest, sole_flange(fit)):
-        # A lens that grows is judged beside an arm's lasting errors. Where it explains more there,
-        # so is one that changed at once.
+        # A lens that grows is judged beside an arm's lasting errors, as is a frame that moved.
+        # Where it explains more there, so is one that changed at once.
         most = alone[one.name].gain
         is_less = one.gain < grown.get(one.lens, -np.inf)
-        yield replace(one, gain=min(one.gain, most) if is_less else most)
+        yield replace(one, gain=min(one.gain, most) if is_less else max(one.gain, most))
 
 
 def zooms(fit: Fit, camera: str, kind: type[LensSteps]) -> Iterator[Effect]:
     """Changes of a lens at once: rivals to what grows, and to what differs from stop to stop."""
     grams = [(gram.stops, fit.used[gram.rows]) for gram in fit.grams if gram.pair[0] == camera]
     stops = np.unique(np.concatenate([own[used] for own, used in grams]))
+    # A stated lens may be that of either part.
+    parts = (False, True) if fit.cell.cameras[camera].stated is not None else (False,)
     for at in (evenly(len(stops) - 3, _ZOOMS) + 2).tolist():
-        yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]))
+        for is_first in parts:
+            yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]), is_first)
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

@@ -2,12 +2,15 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.fit.candidates import candidates, of_stops, opened
+from visioncal.estimation.arm import LEVER_M
+from visioncal.fit.candidates import candidates, moved_instead, of_stops, opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_boards, with_held_lenses, with_small_sizes
 from visioncal.fit.inliers import Effort, Search, nearest
@@ -29,7 +32,7 @@ from visioncal.fit.unknowns import (
 )
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.boards import SHAPES, shape_count
-from visioncal.model.effects import Clock, Effect, Links, Rolling, Size, Zeros
+from visioncal.model.effects import Clock, Effect, LensSteps, Links, Rolling, Size, Zeros
 from visioncal.vision.camera import intrinsics
 
 # Numbers of corners for each unknown of lenses and boards, below which these are held.
@@ -78,11 +81,10 @@ def solve_from(start: Start) -> CellFit:
     refuse_open(fit)
     search, fit, left_out = _explained(search, fit, left_out)
     for _ in range(_OPENED):
-        wider = opened(fit, search.pairs, candidates(fit, search.pairs))
+        wider = _opened_next(search, fit)
         if wider is None:
             break
-        search = search.with_unknowns(wider[0])
-        fit, left_out = search.run(wider[1], fit.used, fit)
+        search, fit, left_out = wider
     again = search.weighed(fit)
     if again is not None:
         search = again
@@ -105,6 +107,20 @@ def solve_from(start: Start) -> CellFit:
     return CellFit(fit, left_out, start, search.effort, doubts)
 
 
+def _opened_next(search: Search, fit: Fit) -> tuple[Search, Fit, LeftOut] | None:
+    """A fit with the effect that explains most; None where none is clear."""
+    among = [*candidates(fit, search.pairs)]
+    for some in (among, [one for one in among if not isinstance(one.effect, LensSteps)]):
+        wider = opened(fit, search.pairs, some)
+        if wider is None:
+            return None
+        other = search.with_unknowns(wider[0])
+        found, left_out = other.run(wider[1], fit.used, fit)
+        if not _is_moved(search, fit, found):
+            break
+    return other, found, left_out
+
+
 def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit, LeftOut]:
     """A fit, or that with an effect of arm or lens by which most of many agree that did not.
 
@@ -124,13 +140,48 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
         other = search.with_unknowns(unknowns)
         found, left = other.run(state, search.sound, known)
         # With more noise anything agrees, and with links that are far off.
-        is_noise = any(
-            found.sizes[size.name] > 2.0 * fit.sizes[size.name] for size in fit.unknowns.noise
-        )
+        before, after = _levels(fit), _levels(found)
+        is_noise = any(after[name] > 2.0 * level for name, level in before.items())
         is_noise |= known is None and any(found.sizes[name] > _MOST_LINKS for name in links)
         if not is_noise and (search.sound & ~found.used).sum() < lost / 2:
+            if known is not None and _is_moved(search, known, found):
+                continue
             return other, found, left
     return search, fit, left_out
+
+
+def _levels(fit: Fit) -> dict[str, float]:
+    """Levels of noise by name, of turns and shifts as one: few stops determine either alone."""
+    levels = {size.name: fit.sizes[size.name] for size in fit.unknowns.noise}
+    for frame in fit.unknowns.erring:
+        turn = LEVER_M * levels.pop(f"rad {frame}")
+        levels[f"m {frame}"] = float(np.hypot(levels[f"m {frame}"], turn))
+    return levels
+
+
+def _is_moved(search: Search, before: Fit, found: Fit) -> bool:
+    """Whether a move at once explains the sightings better than a lens that changed then.
+
+    `before` is the fit without either.
+    """
+    known = {effect.name for effect in before.unknowns.effects}
+    new = [effect for effect in found.unknowns.effects if effect.name not in known]
+    zooms = [effect for effect in new if isinstance(effect, LensSteps)]
+    for move in chain.from_iterable(moved_instead(before, zoom) for zoom in zooms):
+        if move.name in known:
+            continue
+        member = random_effect(move)
+        unknowns = before.unknowns.with_members(member)
+        unknowns = replace(unknowns, effects=(*unknowns.effects, move))
+        values = {**before.state.values, member.key: np.zeros(member.count)}
+        with suppress(np.linalg.LinAlgError):
+            start = State(values, before.state.errors)
+            moved, _ = search.with_unknowns(unknowns).run(start, before.used, before)
+            # Values of other sightings are of another scale.
+            more = int(moved.used.sum()) - int(found.used.sum())
+            if more > 0 or (more == 0 and moved.estimate.value < found.estimate.value):
+                return True
+    return False
 
 
 def with_held_sizes(fit: Fit) -> Unknowns | None:

@@ -16,21 +16,27 @@ _BY_PIXELS = 400.0
 class LensSteps(LensEffect):
     """Focal lengths and centre before a stop, less those from there on, in `LensGrows`' units.
 
-    The picks come after the session: there it is zero.
+    The picks come after the session: there it is zero, or else before.
     """
 
     kind, bounds, count = "lens steps", (1e-2, 1e-6, 0.3), 3
     clause = "the lens changed at once"
     wider = "lens changes"
     stop: int  # The first stop after it.
+    is_first: bool = False  # Whether the lens is that of the views before, as a stated one may be.
+
+    def shares(self, moments: Moments) -> FloatArray:
+        """Shares (k,) of the values by which the lens is another one."""
+        before = (moments.stops >= 0) & (moments.stops < self.stop)
+        return before.astype(float) - self.is_first
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
         found, focal = self.none(moments), self.lens.matrix[:2]
-        before = (moments.stops >= 0) & (moments.stops < self.stop)
-        found[before, :2, 0] = focal
-        found[before, 2, 1] = found[before, 3, 2] = np.mean(focal)
+        shares = self.shares(moments)
+        found[:, :2, 0] = shares[:, None] * focal
+        found[:, 2, 1] = found[:, 3, 2] = shares * np.mean(focal)
         return found
 
 
@@ -49,6 +55,5 @@ class LensChanges(LensSteps):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         found = super().columns(moments, distances)
-        before = (moments.stops >= 0) & (moments.stops < self.stop)
-        found[before, 4, 3] = found[before, 5, 4] = 1.0
+        found[:, 4, 3] = found[:, 5, 4] = self.shares(moments)
         return found
