@@ -49,6 +49,7 @@ from visioncal.core.verdict import (
 )
 from visioncal.estimation.arm import ArmErrors, pose_basis
 from visioncal.estimation.joint import MeasuredScale
+from visioncal.estimation.unknowns import LENS
 from visioncal.model.effects import Window
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
@@ -59,6 +60,7 @@ from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, simulate
+from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import load_target
 
 EXCHANGED = Finding(
@@ -355,6 +357,85 @@ def test_images_that_are_shifted_from_some_view_on_are_distinguished_from_a_came
     moved = simulate(replace(cell.options, camera_moved_m=5e-3))
     bumped = showing(cell, [*cell.corners[:10], *moved.corners[10:]])
     assert calibrated(bumped).verdict.causes[0].kind != "image_shifted"
+
+
+def changed_lens(
+    mount: str, seed: int, *, is_stated: bool, shift_px: float = 0.0, share: float = 0.0
+) -> Finding:
+    """The first cause of a cell whose lens changes at view 13, of an arm that reports no joints."""
+    options = CellOptions(
+        views=24,
+        mount=mount,
+        pixel_sigma_px=0.12,
+        seed=seed,
+        state_intrinsics=is_stated,
+        robot_sigma_m=4e-5,
+        robot_sigma_rad=1e-4,
+    )
+    cell, centre = simulate(options), options.camera.matrix[2:]
+    corners = [
+        replace(at, px=at.px + share * (at.px - centre) + [shift_px, 0.0])
+        for at in cell.corners[13:]
+    ]
+    seen = showing(cell, [*cell.corners[:13], *corners])
+    return calibrated(seen, joints=False).verdict.causes[0]
+
+
+@pytest.mark.parametrize(
+    ("mount", "seed"), [("eye-in-hand", 0), slow("eye-to-hand", 0), slow("eye-to-hand", 1)]
+)
+def test_an_image_that_is_shifted_a_little_is_no_camera_that_moved(mount, seed) -> None:
+    """With an estimated lens, its centre is between both: by noise alone, either half is left."""
+    first = changed_lens(mount, seed, is_stated=False, shift_px=4.0)
+    assert first.kind == "image_shifted"
+    assert first.words.startswith("From view 13 on, the images are shifted by (4")
+
+
+@pytest.mark.parametrize(
+    ("mount", "seed", "is_stated"),
+    [
+        slow("eye-in-hand", 0, True),
+        ("eye-to-hand", 2, True),
+        slow("eye-to-hand", 0, True),
+        slow("eye-to-hand", 2, False),
+    ],
+)
+def test_a_lens_that_was_refocused_at_once_neither_varies_nor_moved(mount, seed, is_stated) -> None:
+    """A stated lens is that of the views before: those after have another one."""
+    first = changed_lens(mount, seed, is_stated=is_stated, share=-0.01)
+    assert first.kind == "focus"
+    (percent,) = re.findall("from view 13 on, its focal length is ([0-9.]+) % shorter", first.words)
+    assert float(percent) == pytest.approx(1.0, abs=0.05)
+    assert "--views 13-23" in first.do.command
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_a_camera_that_moved_a_little_is_no_lens_that_changed(mount, is_stated) -> None:
+    options = CellOptions(views=24, mount=mount, state_intrinsics=is_stated, seed=4)
+    cell, moved = simulate(options), simulate(replace(options, camera_moved_m=1e-3))
+    bumped = showing(cell, [*cell.corners[:10], *moved.corners[10:]])
+    causes = calibrated(bumped, joints=False).verdict.causes
+    assert causes[0].kind in ("moved_at_once", "something_moved")
+    assert not {"focus", "image_shifted"} & {cause.kind for cause in causes}
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
+def test_views_of_another_camera_are_not_in_the_estimate_of_its_lens(mount) -> None:
+    """A camera that was knocked, and its lens with it, so that the lens of all views is neither."""
+    options = CellOptions(
+        views=24, mount=mount, pixel_sigma_px=0.12, seed=1, state_intrinsics=False
+    )
+    cell, moved = simulate(options), simulate(replace(options, camera_moved_m=5e-3))
+    hit = [replace(at, px=at.px + np.array([12.0, 0.0])) for at in moved.corners[14:]]
+    found = calibrated(showing(cell, [*cell.corners[:14], *hit]), joints=False)
+    assert found.verdict.causes[0].views == tuple(range(14, 24))
+    fit = found.assessment.fit
+    (camera,) = fit.unknowns.of(LENS)
+    away = fit.values((LENS, camera)) - intrinsics(options.camera)
+    within = away @ np.linalg.solve(fit.covariance((LENS, camera)), away)
+    assert within < chi2_limit(1e-3, len(away))
 
 
 @pytest.mark.parametrize(("off_mm", "named"), [slow(2.0, []), (30.0, [(7,)])])

@@ -31,6 +31,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.random_effects import random_effects
 from visioncal.calibration.stages.refine import refine_jointly
+from visioncal.calibration.suspects.outliers import views_apart
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
@@ -137,6 +138,7 @@ def _fit(
     if observed.scenes and not inliers.problem.is_combined:
         initial = replace(initial, sizes=error_sizes(observed, start.solved))
     cell_fit = _fit_with_inliers(initial, observed)
+    cell_fit = _with_own_lens(cell_fit, observed)
     if cell_fit.inlier_fit.problem.is_combined and not observed.scenes:
         cell_fit = _with_likelier_noise(cell_fit, observed)
     cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, cell_fit.fit, level))
@@ -165,6 +167,17 @@ def _fit(
             cell_fit = _converge_arms(replace(cell_fit, arms=arms))
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, cell_fit.fit))
+
+
+def _with_own_lens(cell_fit: CellFit, observed: Observed) -> CellFit:
+    """The fit whose lens is not estimated of views that are left out as of another camera."""
+    if cell_fit.linearised_corners is None or not (apart := views_apart(cell_fit)):
+        return cell_fit
+    # The views that are left may be too few for a lens, as the session's are not.
+    with suppress(VisioncalError, np.linalg.LinAlgError):
+        own = replace(cell_fit, apart=apart, linearised_corners=None)
+        return _fit_with_inliers(own, observed)
+    return cell_fit
 
 
 def _with_sizes(cell_fit: CellFit, sigmas: Mapping[str, float]) -> CellFit:

@@ -52,6 +52,9 @@ class CellFit:
     gains: Mapping[str, float] = field(default_factory=dict)
     sizes: ErrorSizes = field(default_factory=ErrorSizes)  # Of errors of lenses and boards.
     solver: str = "joint"  # The solver of the edges.
+    # Views that are left out as of another camera or frame: their lens may be another one, too, and
+    # no lens or board is estimated of them.
+    apart: frozenset[int] = frozenset()
 
     @property
     def noise(self) -> Noise:
@@ -182,4 +185,6 @@ class CellFit:
         repeated = {row.view: (pair, stop if has_robot[pair] else None) for row, pair, stop in rows}
         # Errors of a lens, a print or a detector in one of them are the same in all.
         counts = Counter(repeated.values())
-        return {view: 1.0 / counts[key] for view, key in repeated.items()}
+        return {
+            view: 0.0 if view in self.apart else 1.0 / counts[key] for view, key in repeated.items()
+        }

@@ -201,30 +201,69 @@ def _in_motion(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     yield _fault(cell_fit, "something_moved", outliers[rows].tolist(), words, IN_MOTION, short)
 
 
-def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers that are the views at one end of the session and agree, as where something moved."""
-    inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
+@dataclass(frozen=True, eq=False)
+class _EndRun:
+    """Outliers that are the views at one end of the session."""
+
+    rows: IntArray  # The outliers there.
+    order: IntArray  # (n,) all observations in the order of their stops.
+    at: int  # Place among these of the first observation after the change.
+    is_first: bool  # Whether it is the end before.
+    change: tuple[str, FloatArray] | None  # What they have in common; see `_common_change`.
+
+    @property
+    def later(self) -> IntArray:
+        """Observations after the change, in the session's order."""
+        return np.sort(self.order[self.at :])
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all views of this end are out."""
+        return len(self.rows) == (self.at if self.is_first else len(self.order) - self.at)
+
+
+def _end_run(cell_fit: CellFit) -> _EndRun:
+    inliers = cell_fit.inlier_fit
     order = np.argsort(inliers.problem.observations.stops, kind="stable")
     is_used = inliers.used[order]
     ends = np.append(0, np.cumsum(np.where(is_used, -_BY_CHANCE, 1)))
     first, last = int(ends.argmin()), int(ends.argmax())
     before, after = order[:last][~is_used[:last]], order[first:][~is_used[first:]]
-    run, at = (before, last) if len(before) > len(after) else (after, first)
+    is_first = len(before) > len(after)
+    run, at = (before, last) if is_first else (after, first)
+    most = _AT_END if len(run) > FEWEST_VIEWS else 1.0 / CLEAR_RATIO
+    change = _common_change(inliers, run, most) if len(run) >= FEWEST_VIEWS else None
+    return _EndRun(run, order, at, is_first, change)
+
+
+def views_apart(cell_fit: CellFit) -> frozenset[int]:
+    """Views of one end of the session of which camera, target or a frame was another one."""
+    if cell_fit.cell.mount is None or cell_fit.inlier_fit.used.all():
+        return frozenset()
+    run = _end_run(cell_fit)
+    if run.change is None:
+        return frozenset()
+    return frozenset(cell_fit.cell.rows[row].view for row in run.rows.tolist())
+
+
+def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
+    """Outliers that are the views at one end of the session and agree, as where something moved."""
+    inliers, rows, found = cell_fit.inlier_fit, cell_fit.cell.rows, _end_run(cell_fit)
+    run, change, order = found.rows, found.change, found.order
+    is_used = inliers.used[order]
     words = "Fasten camera and target, keep one board, and one tool and base frame in the "
     words += "controller, and record again"
     if cell_fit.cell.mount == "instrument":
         words = "Leave the instrument where it stands and one probe in one nest, and record again"
-    most = _AT_END if len(run) > FEWEST_VIEWS else 1.0 / CLEAR_RATIO
-    change = _common_change(inliers, run, most) if len(run) >= FEWEST_VIEWS else None
-    if len(run) == np.sum(~is_used) == (at if run is before else len(order) - at):
+    if len(run) == np.sum(~is_used) and found.is_whole:
         # All views of one end and no others: by another pose of each, that is hardly chance.
         by_chance = 2.0 * len(order) / math.comb(len(order), len(run))
         change = change or (("", np.eye(4)) if by_chance < _ONE_END else None)
     if change is not None:
         # Picks come after the session.
-        later = [rows[row].view for row in np.sort(order[at:]).tolist()]
-        when = f"{'before' if run is before else 'from'} view {rows[int(order[at])].view}"
-        when += " on" * (run is after)
+        later = [rows[row].view for row in found.later.tolist()]
+        when = f"{'before' if found.is_first else 'from'} view {rows[int(order[found.at])].view}"
+        when += " on" * (not found.is_first)
         words += f"; or calibrate the {len(later)} views from there on alone"
         if pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]:
             words += ": their result is for the tool and the base frame that were active there"
