@@ -50,6 +50,7 @@ from visioncal.core.verdict import (
 from visioncal.estimation.arm import ArmErrors, pose_basis
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.estimation.unknowns import LENS
+from visioncal.interchange.formats.mending import remove_tool
 from visioncal.model.effects import Window
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
@@ -532,6 +533,43 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     np.testing.assert_allclose(
         [float(x), float(y), float(z)], 1e3 * switched[:3, 3], atol=0.5, rtol=0.01
     )
+    # No knock moves a camera so far.
+    assert "Look whether a tool was active there." in cause.do.words
+    assert "alone (--views 12-17): their result is for the tool" in cause.do.words
+    assert "--without-tool 12-17:" in cause.do.command
+
+
+@pytest.mark.slow
+def test_a_tool_that_is_a_little_longer_from_some_view_on_is_taken_off() -> None:
+    """By less than a hand's slip: no holder that is knocked slips without a turn."""
+    cell = simulate(CellOptions(views=24, seed=3))
+    flange = cell.robot.base_from_flange.copy()
+    flange[12:] = flange[12:] @ exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 4e-3]))
+    session = session_of(cell, flange)
+    cause = calibrate(session).verdict.causes[0]
+    assert cause.kind in ("moved_at_once", "something_moved")
+    option = re.search(r"--without-tool ([0-9-]+):(\S+)", cause.do.command)
+    assert option[1] == "12-23"
+    numbers = tuple(map(float, option[2].split(",")))
+    np.testing.assert_allclose(numbers, [0, 0, 4.0, 0, 0, 0], atol=0.3)
+    mended = calibrate(remove_tool(session, range(12, 24), numbers))
+    assert mended.verdict.status == "good"
+
+
+@pytest.mark.slow
+def test_a_base_frame_that_is_switched_far_is_named_by_one_size() -> None:
+    """A cell in which neither part is left out; the views after it are of that frame."""
+    cell = simulate(CellOptions(views=20, seed=5, mount="eye-to-hand"))
+    switched = exp(np.array([0.0, 0.0, np.pi / 2, 0.31, -0.12, 0.045]))
+    flange = cell.robot.base_from_flange.copy()
+    flange[8:] = invert(switched) @ flange[8:]
+    cause = calibrate(session_of(cell, flange)).verdict.causes[0]
+    assert (
+        "their result is for the tool and the base frame that were active there" in cause.do.words
+    )
+    assert "--views 8-19" in cause.do.command
+    turns = re.findall(r"([0-9.]+) deg", cause.words)[:2]
+    np.testing.assert_allclose([*map(float, turns)], 90.0, atol=1.0)
 
 
 @pytest.mark.slow

@@ -1,8 +1,9 @@
 """Effects beside noise: opened one at a time, where the score of a fit without it is clear."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -390,10 +391,10 @@ def moved_instead(fit: Fit, zoom: LensSteps) -> Iterator[Effect]:
 
 
 def beside_zooms(
-    fit: Fit, changes: Iterable[Candidate], cameras: Iterable[str] = ()
+    fit: Fit, changes: Iterable[Candidate], anyway: Collection[str] = ()
 ) -> Iterator[Candidate]:
     """Candidates that change a lens, and that it changed at once beside clear ones, or anyway."""
-    clear, grown, alone = set(cameras), dict[str, float](), dict[str, Candidate]()
+    clear, grown, alone = set(anyway), dict[str, float](), dict[str, Candidate]()
     for one in changes:
         yield one
         if 2.0 * one.gain >= SIGNIFICANT and one.lens:
@@ -401,8 +402,10 @@ def beside_zooms(
         if isinstance(one.effect, LensGrows):
             grown[one.lens] = max(one.gain, grown.get(one.lens, -np.inf))
     for camera in clear:
+        # Where views disagree, a stated lens may be that of either part.
+        both = camera in anyway and fit.cell.cameras[camera].stated is not None
         for kind in (LensSteps, LensChanges):
-            for one in scored(fit, zooms(fit, camera, kind)):
+            for one in scored(fit, zooms(fit, camera, kind, (False, True)[: 1 + both])):
                 alone[one.name] = max(one, alone.get(one.name, one), key=lambda at: at.gain)
     likeliest = [one.effect for one in alone.values() if one.effect is not None]
     for one in scored(fit, likeliest, sole_flange(fit)):
@@ -413,15 +416,15 @@ def beside_zooms(
         yield replace(one, gain=min(one.gain, most) if is_less else max(one.gain, most))
 
 
-def zooms(fit: Fit, camera: str, kind: type[LensSteps]) -> Iterator[Effect]:
+def zooms(
+    fit: Fit, camera: str, kind: type[LensSteps], are_first: Iterable[bool] = (False,)
+) -> Iterator[Effect]:
     """Changes of a lens at once: rivals to what grows, and to what differs from stop to stop."""
     grams = [(gram.stops, fit.used[gram.rows]) for gram in fit.grams if gram.pair[0] == camera]
     stops = np.unique(np.concatenate([own[used] for own, used in grams]))
-    # A stated lens may be that of either part.
-    parts = (False, True) if fit.cell.cameras[camera].stated is not None else (False,)
-    for at in (evenly(len(stops) - 3, _ZOOMS) + 2).tolist():
-        for is_first in parts:
-            yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]), is_first)
+    changed = (evenly(len(stops) - 3, _ZOOMS) + 2).tolist()
+    for at, is_first in product(changed, are_first):
+        yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]), is_first)
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

@@ -57,13 +57,17 @@ class Cell:
             return f"from stop {self.stops[station]} on"
         return f"from view {self.stops[station]} on"
 
-    def or_separately(self, do: str, station: int) -> Remedy:
+    def views_from(self, station: int) -> list[int]:
+        """The views from a station on."""
+        return [row.view for row in (*self.rows, *self.held) if row.station >= station]
+
+    def or_separately(self, do: str, station: int, note: str = "") -> Remedy:
         """Advice to `do` something and record again, or to calibrate what follows it alone.
 
-        Picks come after the session: what was before a station is no more.
+        Picks come after the session: what was before a station is no more. A note follows.
         """
-        views = [row.view for row in (*self.rows, *self.held) if row.station >= station]
-        words = f"{do}, and record again; or calibrate the {len(views)} views after it alone."
+        views = self.views_from(station)
+        words = f"{do}, and record again; or calibrate the {len(views)} views after it alone{note}."
         either = or_alone(words, views)
         return either if either.command else Remedy(f"{do}, and record again.")
 

@@ -47,6 +47,11 @@ _WRONG = "its pose or its reading is wrong, or something had moved"
 _MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
+# A knock moves what is fastened by less [mm, deg]; a shift whose turn is so small, as a share of it
+# at a holder's length [mm], is none.
+_KNOCKED, _UNTURNED, _HOLDER_MM = (20.0, 5.0), 0.1, 100.0
+# Of views before or after a frame of the controller was switched.
+OF_OTHER_FRAMES = ": their result is for the tool and the base frame that were active there"
 # Another size turns nothing, and a small marker's noise less than so [rad].
 _TURNED_RAD = 0.2
 # Largest share of the way to another stop at which an arm is, and least share of outliers for which
@@ -265,9 +270,13 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         when = f"{'before' if found.is_first else 'from'} view {rows[int(order[found.at])].view}"
         when += " on" * (not found.is_first)
         words += f"; or calibrate the {len(later)} views from there on alone"
-        if pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]:
-            words += ": their result is for the tool and the base frame that were active there"
-        do = or_alone(f"{words}.", later)
+        is_far = pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]
+        note = OF_OTHER_FRAMES * is_far
+        do = or_alone(f"{words}{note}.", later)
+        if is_switched(change[1]):
+            these = [rows[row].view for row in np.sort(run).tolist()]
+            otherwise = f"{words[0].lower()}{words[1:]} (--views {ranges(later)}){note}."
+            do = _tool_taken_off(cell_fit, change, these, otherwise) or do
     else:
         # Views here and there, as of every second row.
         run, when = order[~is_used], "in all of these"
@@ -280,7 +289,8 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         run, change = _alike(inliers, np.sort(run), *change)
         some = [rows[row].view for row in run.tolist()]
         words += ". The result is that of the other views; calibrate these alone, too."
-        do = _tool_taken_off(cell_fit, change, some) or or_alone(words, some)
+        otherwise = "the result is that of the other views."
+        do = _tool_taken_off(cell_fit, change, some, otherwise) or or_alone(words, some)
     what, how = _changed_words(cell_fit, *change)
     outliers = np.sort(run).tolist()
     if cell_fit.may_be_of_arms(change[1]):
@@ -338,22 +348,55 @@ def _pushed_base(cell_fit: CellFit) -> Iterator[PoseFault]:
 
 
 def _tool_taken_off(
-    cell_fit: CellFit, change: tuple[str, FloatArray], views: Sequence[int]
+    cell_fit: CellFit, change: tuple[str, FloatArray], views: Sequence[int], otherwise: str
 ) -> Remedy | None:
-    """Advice to take the tool off some views' poses; None where another frame was another one."""
+    """Advice by a change that some views have in common; see `tool_taken_off`."""
     frame, step = change
+    if not frame:
+        return None
+    edge = cell_fit.fit.frames[frame]
+    return tool_taken_off(cell_fit, frame, (edge, edge @ step), views, otherwise)
+
+
+def tool_taken_off(
+    cell_fit: CellFit,
+    frame: str,
+    edges: tuple[FloatArray, FloatArray],
+    views: Sequence[int],
+    otherwise: str,
+) -> Remedy | None:
+    """Advice to take a tool off some views' poses; None where another frame was another one.
+
+    Args:
+        cell_fit: The fit.
+        frame: The frame that was another one in these views.
+        edges: What it is in the other views, and in these.
+        views: The views.
+        otherwise: What to do where no tool was active.
+    """
     on_camera = "cam" if cell_fit.cell.mount == "eye-in-hand" else "target"
     # Joint angles that belong to the poses rule a tool out.
     has_joints = any(arm.matched is not None for arm in cell_fit.arms.values())
-    if has_joints or not frame.startswith(on_camera) or cell_fit.cell.mount == "instrument":
+    mount = cell_fit.cell.mount
+    if has_joints or not frame.startswith(on_camera) or mount in (None, "instrument"):
         return None
-    edge = cell_fit.fit.frames[frame]
-    tool = edge @ invert(edge @ step)
+    tool = edges[0] @ invert(edges[1])
     twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
     numbers = ",".join(f"{value:.4f}" for value in twist)
     done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
     first = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
-    return replace(done, words=f"{first} Else the result is that of the other views.")
+    return replace(done, words=f"{first} Else {otherwise}")
+
+
+def is_switched(step: FloatArray) -> bool:
+    """Whether a frame of the controller is likelier another one than that something was knocked.
+
+    A knock moves what is fastened by millimetres, and turns it as it shifts it.
+    """
+    mm, deg = pose_difference(np.eye(4), step)
+    arc_mm = _HOLDER_MM * np.deg2rad(deg)
+    is_far = mm > _KNOCKED[0] or deg > _KNOCKED[1]
+    return bool(mm > _ARM_ERRS[0] and (is_far or arc_mm < _UNTURNED * mm))
 
 
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:

@@ -6,11 +6,17 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE
-from visioncal.calibration.suspects.outliers import other_frame
+from visioncal.calibration.suspects.outliers import (
+    OF_OTHER_FRAMES,
+    is_switched,
+    other_frame,
+    tool_taken_off,
+)
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, mm_and_deg, ranges
 from visioncal.core.transforms import exp, pose_difference
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import LEFT_OPEN, Finding, Remedy
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
@@ -39,12 +45,13 @@ def _found(run: RunState) -> Iterator[Finding]:
     if steps[1:]:
         instead = f"{LEFT_OPEN} {_words(steps[1], run)}."
     thing = _THINGS.get(step.of, step.of)
-    fasten = f"Fasten {thing[0].lower()}{thing[1:]}"
+    fasten, note = f"Fasten {thing[0].lower()}{thing[1:]}", ""
     if (
         step.kind == FRAME
         and pose_difference(np.eye(4), exp(step.value))[0] > _LIMITS.arm_errors[0]
     ):
         fasten += ", keep one tool and base frame in the controller"
+        note = OF_OTHER_FRAMES
     kind, do = {
         FRAME: ("moved_at_once", fasten),
         JOINT: ("joint_slipped", "Look whether the joint keeps its zero"),
@@ -55,9 +62,30 @@ def _found(run: RunState) -> Iterator[Finding]:
     yield Finding(
         kind,
         f"{_words(step, run)}; the result is between before and after.{instead}",
-        Remedy(do) if is_drift else cell.or_separately(do, step.stop),
+        Remedy(do)
+        if is_drift
+        else _of_tool(run, step, do) or cell.or_separately(do, step.stop, note),
         mahalanobis_sq=0.0 if is_drift else step.gain,
     )
+
+
+def _of_tool(run: RunState, step: Step, do: str) -> Remedy | None:
+    """Advice to take a tool off the poses after a step, or to `do` something; None for no tool."""
+    if step.kind != FRAME or step.earlier or run.mount is None or not is_switched(exp(step.value)):
+        return None
+    later = run.cell_fit.cell.views_from(step.stop)
+    otherwise = f"{do[0].lower()}{do[1:]}, and record again; or calibrate the {len(later)} views "
+    otherwise += f"after it alone (--views {ranges(later)}){OF_OTHER_FRAMES}."
+    return tool_taken_off(run.cell_fit, step.of, _edges(run, step), later, otherwise)
+
+
+def _edges(run: RunState, step: Step) -> tuple[FloatArray, FloatArray]:
+    """The frame that was moved before and after a step."""
+    fit = run.assessment.sized
+    stepped, solved = with_step(fit.problem, fit.solution, step)
+    edges = stepped.frames(solved.state)
+    *_, before, after = (edges[at] for at in stepped.unknown if at.partition("@")[0] == step.of)
+    return before, after
 
 
 def _words(step: Step, run: RunState) -> str:
@@ -84,13 +112,19 @@ def _words(step: Step, run: RunState) -> str:
             f"{'larger' if first > 0.0 else 'smaller'} (sigma {figure(100.0 * sigma)} %) than "
             f"before, by the robot's motion{source}"
         )
-    moved = mm_and_deg(*pose_difference(np.eye(4), exp(step.value)))
+    far_mm, far_deg = pose_difference(np.eye(4), exp(step.value))
+    is_far = run.mount is not None and step.kind == FRAME and far_mm > _LIMITS.arm_errors[0]
+    if is_far:
+        # A step that is far was linearised at a fit that is far from either part.
+        before, after = _edges(run, step)
+        far_mm, far_deg = pose_difference(before, after)
+    moved = mm_and_deg(far_mm, far_deg)
     if step.kind == DRIFT:
         return (
             "Residuals drift with time: from the first stop to the last, base or target moved by "
             f"{moved}, or the arm grew as it warmed up"
         )
-    mount, far_mm = run.mount, pose_difference(np.eye(4), exp(step.value))[0]
+    mount = run.mount
     on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")
     # Things beside a robot move relative to its base.
     of_base = "" if mount is None or on_flange else ", or the robot's base,"
@@ -103,11 +137,7 @@ def _words(step: Step, run: RunState) -> str:
     words += f"{when}, it is {moved} from where {since}{source}"
     if run.cell_fit.may_be_of_arms(exp(step.value)):
         words += OTHER_POSTURE
-    if mount is not None and far_mm > _LIMITS.arm_errors[0]:
-        fit = run.assessment.sized
-        stepped, solved = with_step(fit.problem, fit.solution, step)
-        edges = stepped.frames(solved.state)
-        *_, before, after = (edges[at] for at in stepped.unknown if at.partition("@")[0] == step.of)
+    if is_far:
         words += f", or the controller's {'tool' if on_flange else 'base frame'} is another one"
         words += f", by {other_frame(before, after)}"
     return words
