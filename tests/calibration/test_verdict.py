@@ -38,6 +38,7 @@ from visioncal.core.verdict import (
     CALIBRATE,
     GUESS,
     GUESS_AND_CALIBRATE,
+    LEFT_OPEN,
     PLAN,
     READ_AGAIN,
     Finding,
@@ -170,6 +171,12 @@ def test_another_size_is_reported_under_the_key_of_the_targets_file(name, said) 
     found = scale_finding("board", load_target(name), MEASURED, MEASURED, "left")
     assert said in found.words
     assert "--board-scale left:1.0047 " in found.do.command
+    # By so little, an arm may err as well; by more, none does.
+    assert "the board is as stated, and the arm goes 0.47 % less far than it reports" in found.words
+    larger = replace(MEASURED, scale=9e-3)
+    found = scale_finding("board", load_target(name), larger, larger, "left")
+    assert LEFT_OPEN not in found.words
+    assert "if the board is right, the arm's model is off by as much" in found.words
 
 
 @pytest.mark.parametrize(("tilt_deg", "kind"), [(60.0, "window"), (103.0, "lens_field")])
@@ -527,6 +534,7 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     cause = calibrate(session_of(cell, flange)).verdict.causes[0]
     assert cause.kind == "something_moved"
     # Of the two parts the larger one is kept.
+    assert "The result is that of the views before." in cause.words
     assert "from view 12 on, the camera or the controller's tool was another one" in cause.words
     # What the controller's table of tools has to be compared with.
     x, y, z = re.search(r"tool by \(([^)]*)\) mm and 49 deg", cause.words)[1].split(", ")
@@ -1164,7 +1172,11 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
 def test_nothing_is_said_of_an_accuracy_where_no_fit_explains_the_views(changes, need) -> None:
     parts = {name: of_size(60.0).parts["calibration"] for name in ("calibration", "look", "pick")}
     picks = (replace(of_size(0.1), parts=parts),)
-    verdict = judge(replace(changed(SOUND, **changes), picks=picks, need=need))
+    findings = replace(changed(SOUND, **changes), picks=picks, need=need)
+    # What the frames of the result would be is asked of a result alone.
+    far = [Finding(kind, "The target is far.") for kind in ("carried_away", "mirrored_cell")]
+    verdict = judge(replace(findings, warnings=(*findings.warnings, *far)))
+    assert "The target is far." not in " ".join(verdict.reasons)
     assert (verdict.status, verdict.has_accuracy) == ("bad", False)
     assert verdict.good_for_mm is verdict.good_for_mm_uncorrected is None
     # Neither what tasks it would be good for, nor what picks err by, nor another robot.

@@ -589,6 +589,8 @@ WORLDS: dict[str, World] = {
         FINE,
         printed([0.012, 0.0], [0.0, 0.0]),
         causes=("board_size",),
+        # One fact is one cause.
+        never=frozenset({"board_shape"}),
         words=(r"the board is (\S+) % longer along its x",),
         figure=(1.2, 0.05),
         of=NONE,

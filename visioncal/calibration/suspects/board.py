@@ -15,7 +15,7 @@ from visioncal.core.number_format import counted, figure, ranges
 from visioncal.core.quantiles import FALSE_ALARM, SIGMA_PER_MAD, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import Corners, FloatArray, Target
-from visioncal.core.verdict import NOTE, Finding, Remedy
+from visioncal.core.verdict import LEFT_OPEN, NOTE, Finding, Remedy
 from visioncal.estimation.appearance import ASPECT, BOARD_NAMES, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
@@ -32,6 +32,9 @@ from visioncal.vision.targets import corner_positions
 
 # Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
+# Share by which arms go farther than they report, at most: 3 mm in 0.6 m. No view distinguishes it
+# from a board of another size.
+_ARM_SCALES = 5e-3
 # Share by which ink and light widen printed circles, and fewest images that show them wider.
 _INK, _FEWEST_DRAWN = 0.03, 3
 # Accuracy of printed boards [m].
@@ -59,11 +62,13 @@ def _found(run: RunState) -> Iterator[Finding]:
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
                 yield scale_finding(f"target {target.name}", target, measured, measured, name)
             continue
-        written = estimated_scale(fitted, name, target)
+        written, is_named = estimated_scale(fitted, name, target), False
         if written is not None and (measured.is_another or written.leaves_stated):
-            found = scale_finding(called, target, measured, written, name)
-            yield _stretched(found, fitted, board, called)
-        yield from _shape_findings(fitted, name, target, called)
+            plain = scale_finding(called, target, measured, written, name)
+            found = _stretched(plain, fitted, board, called)
+            is_named = found is not plain
+            yield found
+        yield from _shape_findings(fitted, name, target, called, is_named=is_named)
 
 
 def _of_prints(run: RunState) -> Iterator[Finding]:
@@ -158,9 +163,14 @@ def scale_finding(
         found = side * (1 + written.scale)
         words = (
             f"{size}: {kind.sides} of {found:.4g} mm, not of {side:.4g} mm (stated to within "
-            f"{share}). The result takes the robot's scale; if the board is right, the arm's model "
-            "is off by as much."
+            f"{share}). The result takes the robot's scale"
         )
+        if abs(written.scale) <= _ARM_SCALES:
+            far = "farther" if written.scale < 0 else "less far"
+            words += f".{LEFT_OPEN} the board is as stated, and the arm goes "
+            words += f"{figure(100 * abs(written.scale))} % {far} than it reports."
+        else:
+            words += "; if the board is right, the arm's model is off by as much."
         first = "Measure the board over its whole width."
     total = measured.sigma**2 + measured.stated_sigma**2
     square = measured.scale**2 / total
@@ -190,8 +200,13 @@ def _stretched(found: Finding, fitted: Fit, board: tuple[str, str], called: str)
     )
 
 
-def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iterator[Finding]:
-    """Finding on a bent, stretched or sheared board, beyond the accuracy of printing."""
+def _shape_findings(
+    fitted: Fit, name: str, target: Target, called: str, *, is_named: bool
+) -> Iterator[Finding]:
+    """Finding on a bent, stretched or sheared board, beyond the accuracy of printing.
+
+    `is_named` is whether the finding on its size has the stretch.
+    """
     board = (BOARD, name)
     shape = fitted.values(board)
     columns, values = fitted.unknowns.columns(board), fitted.unknowns.values_of(board)
@@ -199,12 +214,13 @@ def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iter
     def has_moved(*chosen: int) -> bool:
         return has_changed(fitted, columns[np.isin(values, chosen)])
 
-    drawn, named = np.where(np.arange(len(shape)) == SCALE, shape, 0.0), len(BOARD_NAMES)
+    stretch, named = [] if is_named else [ASPECT], len(BOARD_NAMES)
+    drawn = np.where(np.isin(np.arange(len(shape)), [SCALE, *[ASPECT] * is_named]), shape, 0.0)
     corners, even = (shaped_corners(target, at) for at in (shape, drawn))
     off_m = np.linalg.norm(corners - even, axis=1).max()
     bends = np.setdiff1d(np.arange(named), [SCALE, ASPECT, SHEAR])
     points = np.arange(named, len(shape))
-    if not has_moved(ASPECT, *bends, SHEAR, *points) or off_m < _LEAST_BEND_M:
+    if not has_moved(*stretch, *bends, SHEAR, *points) or off_m < _LEAST_BEND_M:
         return
     flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."
     if len(points) and has_moved(*points):
@@ -213,7 +229,7 @@ def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iter
         yield Finding("board_shape", f"{words} The result counts it.", Remedy(do))
         return
     parts = []
-    if has_moved(ASPECT):
+    if has_moved(*stretch):
         longer = float(shape[ASPECT])
         far, near = ("y", "x") if longer > 0 else ("x", "y")
         parts.append(

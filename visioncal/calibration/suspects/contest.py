@@ -20,7 +20,7 @@ from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import LEFT_OPEN, Finding
 from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.problem import Problem
@@ -30,6 +30,7 @@ from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import FRAME, with_step
 from visioncal.estimation.unknowns import BOARD, LENS, SIZE
 from visioncal.model.effects import Creeps, JointsCreep
+from visioncal.model.effects.posture import Stretches
 from visioncal.robot.model import REPEATABILITY
 from visioncal.vision.camera import intrinsics
 
@@ -89,13 +90,16 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         is_apart = bool(trial.is_in_fit and CLEAR_RATIO**2 * left[1] < left[0])
         if is_apart:
             rest = min(rest, 1.0 - share)
-        is_proven, instead = bool(finding.mahalanobis_sq) and _proves(run, trial), ""
+        # Of what no view distinguishes, no cure proves one.
+        is_proven = bool(finding.mahalanobis_sq) and LEFT_OPEN not in finding.words
+        is_proven, instead = is_proven and _proves(run, trial), ""
         if finding.kind in KINDS:
             # The fit here knows of a lens what the one likelihood of all corners found, which is no
             # rival's: there they were tried.
             kind, sizes = KINDS[finding.kind].kind, run.cell_fit.sizes
             is_proven &= kind in sizes.rivals and not sizes.rivals[kind]
-            instead = sizes.instead_of(kind)
+            instead = sizes.instead_of(kind) or _of_joint(run, finding.kind)
+            is_proven &= not instead
         if finding.kind in STEPS:
             is_stepped |= is_proven
             # Others about as likely are named with it.
@@ -141,6 +145,15 @@ def _proves(run: RunState, trial: Trial) -> bool:
     )
     gain = 2.0 * (lost - least - float(np.log(CheckLimits.ruled_out)))
     return all(step.gain <= gain for step in rivals)
+
+
+def _of_joint(run: RunState, kind: str) -> str:
+    """A joint that looks like a linear axis, as a sentence; empty where the joints are known."""
+    if not issubclass(KINDS[kind], Stretches) or all(
+        arm.is_modelled for arm in run.cell_fit.arms.values()
+    ):
+        return ""
+    return f"{LEFT_OPEN} a joint of the arm turns by another share than it reports."
 
 
 def _may_be_of_arm(run: RunState) -> bool:
