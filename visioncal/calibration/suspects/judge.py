@@ -62,7 +62,9 @@ def judge(findings: Findings) -> Verdict:
     # Sigmas are those of a model, and say nothing where it does not explain what was seen.
     is_misfit = any(doubt.is_fatal and doubt.kind in _MISFITS for doubt in doubts)
     if is_unknown := is_misfit and status == "bad":
-        findings, picks = replace(findings, picks=()), ()
+        warnings = [found for found in warnings if not SUSPECTS[found.kind].of_result]
+        doubts = [doubt for doubt in doubts if not SUSPECTS[doubt.kind].of_result]
+        findings, picks = replace(findings, warnings=warnings, picks=()), ()
     own = [pick.uncorrected or pick for pick in picks] if is_calibrated else []
     worst, uncorrected = (least_precise(some) if some else None for some in (picks, own))
     good_for_mm, uncorrected_mm = (_good_for_mm(pick, found) for pick in (worst, uncorrected))

@@ -96,5 +96,5 @@ def _is_of_camera(camera: FloatArray, target: FloatArray) -> bool:
 
 # A result by such poses is of nothing else.
 CAMERA_POSES = Suspect("camera_poses", None, FACT, hides=(CHAIN, *BY_CHAIN), inflates=SOURCES)
-MIRRORED_CELL = Suspect("mirrored_cell", _found, 1e-2)
-TOOL_ACTIVE = Suspect("tool_active", chance=1e-2)
+MIRRORED_CELL = Suspect("mirrored_cell", _found, 1e-2, of_result=True)
+TOOL_ACTIVE = Suspect("tool_active", chance=1e-2, of_result=True)

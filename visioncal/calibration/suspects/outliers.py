@@ -214,7 +214,7 @@ class _EndRun:
     order: IntArray  # (n,) all observations in the order of their stops.
     at: int  # Place among these of the first observation after the change.
     is_first: bool  # Whether it is the end before.
-    change: tuple[str, FloatArray] | None  # What they have in common; see `_common_change`.
+    change: tuple[str, FloatArray] | None  # Common to these; see `_common_change`.
 
     @property
     def later(self) -> IntArray:
@@ -269,6 +269,8 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         later = [rows[row].view for row in found.later.tolist()]
         when = f"{'before' if found.is_first else 'from'} view {rows[int(order[found.at])].view}"
         when += " on" * (not found.is_first)
+        which = "from there on" if found.is_first else "before"
+        kept = f" The result is that of the views {which}."
         words += f"; or calibrate the {len(later)} views from there on alone"
         is_far = pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]
         note = OF_OTHER_FRAMES * is_far
@@ -291,13 +293,14 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         words += ". The result is that of the other views; calibrate these alone, too."
         otherwise = "the result is that of the other views."
         do = _tool_taken_off(cell_fit, change, some, otherwise) or or_alone(words, some)
+        kept = ""
     what, how = _changed_words(cell_fit, *change)
     outliers = np.sort(run).tolist()
     if cell_fit.may_be_of_arms(change[1]):
         how += OTHER_POSTURE
     elif change[0] and np.less(pose_difference(np.eye(4), change[1]), _ARM_ERRS).all():
         how += ", or another load bends the arm"
-    words = f"{{views}} were left out: {when}, {what} was another one{how}."
+    words = f"{{views}} were left out: {when}, {what} was another one{how}.{kept}"
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
 
 

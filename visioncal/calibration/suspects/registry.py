@@ -105,7 +105,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     turned_views.TURNED_VIEWS,
     late_poses.LATE_POSES,
     mirrored_cell.TOOL_ACTIVE,
-    Suspect("carried_away", is_doubt=False),
+    Suspect("carried_away", is_doubt=False, of_result=True),
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
     # Images and readings.

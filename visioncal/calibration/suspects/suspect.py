@@ -48,6 +48,8 @@ class Suspect:
     hides: tuple[str, ...] = ()
     inflates: tuple[str, ...] = ()  # Sources of errors that it inflates.
     is_doubt: bool = True  # Whether it is a doubt about the result.
+    # Whether it judges the frames of the result, which say nothing where no fit explains the views.
+    of_result: bool = False
     is_sigma: bool = False  # Whether it is a sigma beyond a limit of its own.
     # Rank among findings on the size of errors, the most important first; 0 for none.
     size: int = 0
