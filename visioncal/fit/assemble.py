@@ -66,11 +66,13 @@ def _terms(gram: Gram, bodies: Sequence[Body]) -> list[Term]:
         if f:
             body = bodies[at]
             units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
-            errors = np.zeros((len(body.stops), body.width, body.width))
-            cross = np.zeros((len(body.stops), body.width, len(common)))
+            # Of many stops a few alone are in these sightings.
+            held, units = np.unique(units, return_inverse=True)
+            errors = np.zeros((len(held), body.width, body.width))
+            cross = np.zeros((len(held), body.width, len(common)))
             np.add.at(errors, (units[:, None, None], own[:, None], own), of_errors[:, :, :f])
             np.add.at(cross, (units[:, None], own), of_errors[:, :, f:])
-            parts = (Part(at, gram.columns, errors, cross),)
+            parts = (Part(at, gram.columns, errors, cross, held),)
         count = float(products.counts.sum())
         found.append(Term(products.size, count, gram.columns, common, parts))
     return found

@@ -32,6 +32,8 @@ class Part:
     columns: IntArray  # (c,) of the common unknowns.
     errors: FloatArray  # (u, m, m) Gram matrices of the errors of each unit.
     cross: FloatArray  # (u, m, c + 1) with the columns and the residual.
+    # Numbers of these units, ascending; None for all of the body's.
+    units: IntArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +276,13 @@ def summed(terms: Sequence[Term], bodies: Sequence[Body]) -> Term:
         units, width = len(bodies[body].stops), bodies[body].width
         errors, cross = np.zeros((units, width, width)), np.zeros((units, width, len(union) + 1))
         for part in own:
-            errors += part.errors
-            cross[:, :, np.append(np.searchsorted(union, part.columns), len(union))] += part.cross
+            at = np.append(np.searchsorted(union, part.columns), len(union))
+            if part.units is None or len(part.units) == units:
+                errors += part.errors
+                cross[:, :, at] += part.cross
+            else:
+                errors[part.units] += part.errors
+                cross[part.units[:, None, None], np.arange(width)[:, None], at] += part.cross
         parts.append(Part(body, union, errors, cross))
     count = sum(term.count for term in terms)
     return Term(terms[0].size, count, columns, common, tuple(parts))
