@@ -2,11 +2,14 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.drawn import column
+from support.edited import rewritten
 from support.marks import slow
 from support.misfits import misfit
 from support.problems import observed, pose, world
@@ -291,6 +294,33 @@ def test_rows_with_the_name_of_another_camera_or_board_are_named(column, names, 
         views = [view for view in cause.views if wrong[view] == name]
         assert f"{other[name]} for {name} in column {column} of view" in cause.do.words
         assert all(str(view) in cause.do.words for view in views[:8])
+
+
+@pytest.mark.slow
+def test_rotation_vectors_of_a_whole_cell_become_quaternions(tmp_path, monkeypatch, three):
+    monkeypatch.chdir(tmp_path)
+    three.save("cell")
+    turns = {
+        view.number: at.as_matrix()[:3, :3]
+        for view in three.views
+        if (at := view.base_from_flange()) is not None
+    }
+
+    def as_vector(row):
+        if int(row["view"]) not in turns:
+            return row
+        vector = Rotation.from_matrix(turns[int(row["view"])]).as_rotvec().tolist()
+        return row | dict(zip(POSE[3:], [*map(str, vector), ""], strict=True))
+
+    rewritten(Path("cell"), lambda _, row: as_vector(row))
+    visioncal("calibrate", "cell").refused("visioncal convert cell cell-fixed --guess --yes && ")
+    visioncal("convert", "cell", "cell-fixed", "--guess", "--yes").good()
+    mended = Session.load("cell-fixed")
+    # No number was misread: these are the columns of another form.
+    assert not mended.declaration.corrected
+    read = {at.number: at.base_from_flange() for at in mended.views}
+    for number, turn in turns.items():
+        np.testing.assert_allclose(read[number].as_matrix()[:3, :3], turn, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -353,12 +353,14 @@ def reread_robot(
     document, words = {**session.document}, candidate.words
     if table := _robot_table(doubtful, candidate, robot).get("robot"):
         document["robots"] = {**document["robots"], robot: table}
-    change = f"Poses of robot {robot} are read otherwise than at first: {words}."
+    # Another form of the same numbers, which the columns show, is no change.
+    is_other = bool(candidate.hypothesis.changes)
+    changes = (f"Poses of robot {robot} are read otherwise than at first: {words}.",) * is_other
     changed = session.with_content(
-        document=noting(session, document, [change]),
+        document=noting(session, document, changes),
         cells=[[row[name] for name in session.columns] for row in cells],
     )
-    read = replace(changed, warnings=tuple(dict.fromkeys((change, *session.warnings))))
+    read = replace(changed, warnings=tuple(dict.fromkeys((*changes, *session.warnings))))
     return replace(doubtful, session=read)
 
 
