@@ -63,7 +63,7 @@ from visioncal.session import Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, simulate
 from visioncal.vision.camera import intrinsics
-from visioncal.vision.targets import load_target
+from visioncal.vision.targets import corner_positions, load_target
 
 EXCHANGED = Finding(
     "exchanged_views",
@@ -699,6 +699,22 @@ def test_a_tool_that_was_active_is_asked_for(mount, tool_mm, where) -> None:
         assert "Was a tool active on the controller" in finding.words
         assert finding.do in verdict.next_steps
         assert finding.words in " ".join(verdict.top)
+
+
+def test_a_large_board_is_where_its_middle_is() -> None:
+    """Its first corner is half a metre from the flange that holds its middle."""
+    target = replace(CellOptions().target, columns=13, rows=8, square_m=0.06, marker_m=0.045)
+    cell = simulate(CellOptions(views=14, mount="eye-to-hand", target=target, seed=2))
+    middle = corner_positions(target).mean(axis=0)
+    edge = cell.transforms["flange_from_target"]
+    turn = edge[:3, :3]
+    held = compose(turn, np.array([0.0, 0.0, 0.35]) - turn @ middle)
+    flange = cell.robot.base_from_flange @ edge @ invert(held)
+    known = calibrate(session_of(cell, flange))
+    found = known.edges["flange_from_target"].matrix
+    assert np.linalg.norm(found[:3, 3]) > 0.5
+    np.testing.assert_allclose((found @ [*middle, 1.0])[:3], [0.0, 0.0, 0.35], atol=5e-3)
+    assert "carried_away" not in {finding.kind for finding in known.verdict.findings}
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -9,8 +9,10 @@ from visioncal.calibration.suspects.misread_poses import BY_CHAIN
 from visioncal.calibration.suspects.suspect import CHAIN, FACT, SOURCES, Suspect
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
+from visioncal.core.transforms import apply
 from visioncal.core.types import MOUNTS, FloatArray
 from visioncal.core.verdict import Finding, Remedy
+from visioncal.vision.targets import corner_positions
 
 # A part on a flange may be so far from it [m], also where the poses are in the board's frame;
 # seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist;
@@ -65,7 +67,8 @@ def _found(run: RunState) -> Iterator[Finding]:
     edge = run.assessment.last_edges[carried]
     depth_m, (*_, along_z) = -edge.matrix[2, 3], edge.matrix[:3, :3] @ edge.covariance[3:, 3:]
     sigma_m = float(np.sqrt(max(along_z @ edge.matrix[2, :3], 0.0)))
-    where = f"{carried_m:.2f} m away from" if carried_m > _FAR_M else ""
+    away_m = carried_m if in_hand else _middle_m(run, edge.matrix)
+    where = f"{away_m:.2f} m away from" if away_m > _FAR_M else ""
     if in_hand and depth_m > _BEHIND_M + 3.0 * sigma_m:
         where = f"{figure(1e3 * depth_m)} mm behind"
     # Where session.toml has its place, that was measured.
@@ -85,6 +88,13 @@ def _found(run: RunState) -> Iterator[Finding]:
                 f"tool active alone.{stated}"
             ),
         )
+
+
+def _middle_m(run: RunState, flange_from_target: FloatArray) -> float:
+    """Distance of a carried target from its flange: a large board's first corner is farther [m]."""
+    middles = [corner_positions(board).mean(axis=0) for board in run.session.boards.values()]
+    middle = middles[0] if len(middles) == 1 else np.zeros(3)
+    return float(np.linalg.norm(apply(flange_from_target, middle)))
 
 
 def _is_of_camera(camera: FloatArray, target: FloatArray) -> bool:
