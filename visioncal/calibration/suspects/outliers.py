@@ -47,9 +47,8 @@ _WRONG = "its pose or its reading is wrong, or something had moved"
 _MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
-# A knock moves what is fastened by less [mm, deg]; a shift whose turn is so small, as a share of it
-# at a holder's length [mm], is none.
-_KNOCKED, _UNTURNED, _HOLDER_MM = (20.0, 5.0), 0.1, 100.0
+# A knock moves what is fastened by less [mm, deg].
+_KNOCKED = 20.0, 5.0
 # Of views before or after a frame of the controller was switched.
 OF_OTHER_FRAMES = ": their result is for the tool and the base frame that were active there"
 # Another size turns nothing, and a small marker's noise less than so [rad].
@@ -394,12 +393,9 @@ def tool_taken_off(
 def is_switched(step: FloatArray) -> bool:
     """Whether a frame of the controller is likelier another one than that something was knocked.
 
-    A knock moves what is fastened by millimetres, and turns it as it shifts it.
+    A knock moves what is fastened by millimetres.
     """
-    mm, deg = pose_difference(np.eye(4), step)
-    arc_mm = _HOLDER_MM * np.deg2rad(deg)
-    is_far = mm > _KNOCKED[0] or deg > _KNOCKED[1]
-    return bool(mm > _ARM_ERRS[0] and (is_far or arc_mm < _UNTURNED * mm))
+    return bool(np.greater(pose_difference(np.eye(4), step), _KNOCKED).any())
 
 
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
