@@ -1,5 +1,6 @@
 """Normal equations of a problem: whitening, and elimination of the flanges' errors."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,22 @@ class Reduced:
     # (u, 6 w, 6 w) Jacobian of these estimates by the flange poses: the identity where the flanges
     # were observed and the errors are their own.
     by_flanges: FloatArray
+
+
+# Shares of the diagonal that rounding may take, the least that helps comes first.
+_ROUNDED = (1e-15, 1e-12, 1e-9)
+
+
+def _factors(information: FloatArray) -> FloatArray:
+    """Cholesky factors of (u, m, m) information; raises LinAlgError where it is far from positive.
+
+    Beside errors that are 1e8 times the noise, rounding takes what the noise leaves.
+    """
+    diagonal = np.diagonal(information, axis1=1, axis2=2)[:, :, None] * np.eye(information.shape[1])
+    for ridge in (0.0, *_ROUNDED[:-1]):
+        with suppress(np.linalg.LinAlgError):
+            return np.asarray(np.linalg.cholesky(information + ridge * diagonal), dtype=float)
+    return np.asarray(np.linalg.cholesky(information + _ROUNDED[-1] * diagonal), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +74,7 @@ class Whitening:
         information = np.zeros((len(members), width, width))
         np.add.at(information, units[shared], weighted @ by_errors[shared])
         roots = np.sqrt(errors)
-        factor = np.linalg.cholesky(roots @ information @ roots + np.eye(width))
+        factor = _factors(roots @ information @ roots + np.eye(width))
         taken[shared] = (np.linalg.inv(factor) @ roots)[units[shared]] @ weighted
         return cls(weights, taken, units, len(members))
 
