@@ -157,7 +157,7 @@ FAULTS = {
     ),
     "another mount": Fault("misread_poses", document_of(turned_off)),
     "a board of another size": Fault(
-        "board_size", options=replace(SOUND, board_scale=1.03), command="target make"
+        "board_size", options=replace(SOUND, board_scale=1.03), command="--board-scale"
     ),
     "a lens of another camera": Fault("lens", document_of(moved_lens), command="calibrate"),
     "a lens without its distortion": Fault(
