@@ -22,9 +22,10 @@ from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.suspects.moved_frames import moved_findings
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import view_words
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Target
-from visioncal.interchange.formats.mending import exchange_views
+from visioncal.interchange.formats.mending import exchange_views, shift_views
 from visioncal.present.recording import paths, read_evidence
 from visioncal.results import Calibration
 from visioncal.results.edge import Edge
@@ -293,7 +294,7 @@ def test_rows_with_the_name_of_another_camera_or_board_are_named(column, names, 
     for name in names:
         views = [view for view in cause.views if wrong[view] == name]
         assert f"{other[name]} for {name} in column {column} of view" in cause.do.words
-        assert all(str(view) in cause.do.words for view in views[:8])
+        assert f"column {column} of {view_words(views)}" in cause.do.words
 
 
 @pytest.mark.slow
@@ -321,6 +322,25 @@ def test_rotation_vectors_of_a_whole_cell_become_quaternions(tmp_path, monkeypat
     read = {at.number: at.base_from_flange() for at in mended.views}
     for number, turn in turns.items():
         np.testing.assert_allclose(read[number].as_matrix()[:3, :3], turn, atol=1e-9)
+
+
+def test_rows_without_a_pose_stay_where_those_of_their_robot_are_shifted():
+    options = NetworkOptions(
+        robots=ROBOTS[:1], cameras=(LEFT,), boards=(FLOOR, BoardAt("plate", on="a")), stops=8
+    )
+    session = cell_session(simulate(options), "cell", seen="poses")
+    posed = [view.number for view in session.views if view.base_from_flange() is not None]
+    before = {view.number: view for view in session.views}
+    # Rows that show the floor are named, too, as by a range of views.
+    shifted = shift_views(session, range(posed[2], max(before) + 1), -1)
+    after = {view.number: view for view in shifted.views}
+    # The row before keeps its pose, which no other row has then.
+    assert before.keys() - after.keys() == {posed[2]}
+    for number, source in zip(posed[3:], posed[2:], strict=False):
+        assert after[number].cell("x_m") == before[source].cell("x_m")
+        assert after[number].cell("cft_x_m") == before[number].cell("cft_x_m")
+    for number in after.keys() - {*posed[3:]}:
+        assert all(after[number].cell(at) == before[number].cell(at) for at in session.columns)
 
 
 @pytest.mark.slow

@@ -87,7 +87,7 @@ def _chosen(recorded: DoubtfulSession | DoubtfulRobot, *, yes: bool) -> Candidat
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
     if isinstance(recorded, DoubtfulRobot):
-        say(f"Robot {recorded.robot}:")
+        say(f"Robot {recorded.robot}:" if recorded.robot else "The robot:")
     at = guess.candidates.index(guess.best)
     shown = guess.candidates[: max(_SHOWN, at + 1)]
     left = len(guess.candidates) - len(shown)

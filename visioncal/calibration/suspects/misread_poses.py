@@ -50,7 +50,7 @@ from visioncal.core.verdict import (
 )
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
-from visioncal.session.kinds import name_of
+from visioncal.session.kinds import has_robot_state, name_of
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -145,7 +145,8 @@ def with_undone(run: RunState) -> RunState:
             mistake = likeliest(of_pair(run, robot, pair))
             if mistake is None:
                 continue
-            whose = f"Robot {robot}, in its rows of {pair.camera} and {pair.target}"
+            whose = f"robot {robot}" if robot else "the robot"
+            whose = f"{whose[0].upper()}{whose[1:]}, in its rows of {pair.camera} and {pair.target}"
             found, do = mistake.found, mistake.found.do
             if do is not None and "--views" in do.command:
                 # The other views are those of all pairs.
@@ -168,10 +169,16 @@ def _of_all_rows(found: Finding, run: RunState, robot: str) -> Remedy | None:
     named = None if do is None else _ON_VIEWS.search(do.command)
     if do is None or named is None:
         return do
-    of_robot = [at for at in rows if name_of(run.session.declaration, "robot", at) == robot]
-    stops = {at.stop for at in of_robot if at.number in found.views}
+    stops = {at.stop for at in rows if at.number in found.views}
+    of_robot = [
+        at
+        for at in rows
+        if has_robot_state(at) and name_of(run.session.declaration, "robot", at) == robot
+    ]
+    ends = [at for at, view in enumerate(of_robot) if view.stop in stops]
+    if not ends:
+        return Remedy(do.words)
     if named[1] == "shift":
-        ends = [at for at, view in enumerate(of_robot) if view.stop in stops]
         stops = {at.stop for at in of_robot[ends[0] : ends[-1] + 1]}
     start, end = named.span(2)
     every = ranges([at.number for at in of_robot if at.stop in stops])

@@ -133,7 +133,12 @@ def explained_outliers(
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
     if cell_fit.cell.mount is not None and not faults:
-        faults += [*_in_motion(cell_fit, outliers)] or _moved_run(cell_fit)
+        # One change of a frame explains a push along the motion, too.
+        alike = _end_run(cell_fit).change or _common_change(
+            agreed, outliers, 1.0 / CLEAR_RATIO, _ARM_LEAVES
+        )
+        on_the_way = [*_in_motion(cell_fit, outliers)] if alike is None else []
+        faults += on_the_way or _moved_run(cell_fit)
     if cell_fit.cell.mount is None and not faults:
         faults += [*_misnamed(cell_fit, outliers)] or _pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
@@ -199,7 +204,7 @@ def _in_motion(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
         (1, True): "the pose was read once the arm had left",
     }[by, is_beyond]
     low, high = (figure(100.0 * float(share)) for share in (shares.min(), shares.max()))
-    how = f"by {low} to {high} % of the way to the {which} stop"
+    how = f"by {low}{f' to {high}' * (low != high)} % of the way to the {which} stop"
     short = f"the arm moved between image and pose, {how}"
     words = f"{{views}} were left out: {short}, along the line between both: {when}."
     yield _fault(cell_fit, "something_moved", outliers[rows].tolist(), words, IN_MOTION, short)
@@ -323,9 +328,9 @@ def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
             f"{object_name(other, column)} for {object_name(stated, column)} in column {column} of "
             f"{view_words(views)}"
         )
-    named = listed([f"{stated} is {other}" for stated, other in several])
+    named = listed([f"{other} in place of {stated}" for stated, other in several])
     short = "the name of its camera or of its target is another one's"
-    words = f"{{views}} were left out: they fit where {named}, as rows with exchanged names do."
+    words = f"{{views}} were left out: they fit with {named}, as rows with exchanged names do."
     do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
     yield _fault(cell_fit, MISNAMED, every, words, do, short)
 

@@ -23,7 +23,7 @@ from visioncal.session.columns import (
     POSE,
     pose_row,
 )
-from visioncal.session.kinds import declared_targets, name_of
+from visioncal.session.kinds import declared_targets, has_robot_state, name_of
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.camera import turned_back
 from visioncal.vision.targets import corner_positions
@@ -120,10 +120,14 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
     moved, rows = set(_chosen_views(session, views, "--shift")), session.views
     kept, of_robot = {*_OBSERVED, *_MUST_AGREE, "view", "role"}, [*range(len(rows))]
     stops = [(-1, at) for at in of_robot]
+    counted_by = "row"
     if is_whole_cell(session):
         of_robot, kept = _rows_of_one_robot(session, moved), {*kept, "stop", "robot"}
+        # Other rows of these stops have no pose of their own to be given another one.
+        moved &= {rows[at].number for at in of_robot}
         # A row without a number of its stop is a stop of its own.
         stops = [(-1, at) if view.stop is None else (view.stop, -1) for at, view in enumerate(rows)]
+        counted_by = "stop of this robot"
     order = [*dict.fromkeys(stops[at] for at in of_robot)]
     first = {stops[at]: at for at in reversed(of_robot)}
     changed = {stops[at] for at in of_robot if rows[at].number in moved}
@@ -141,7 +145,7 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
             {name: (view if name in kept else rows[source]).cell(name) for name in session.columns}
         )
     lost = f"; {ranges(dropped)} had none there and were dropped" if dropped else ""
-    note = f"views {ranges(moved)} have the robot's poses of the row {by:+d}{lost}"
+    note = f"views {ranges(moved)} have the robot's poses of the {counted_by} {by:+d}{lost}"
     corners = session.corner_table
     if corners is not None:
         corners = corners.of_views([view.number for view in rows if view.number not in dropped])
@@ -149,21 +153,25 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
 
 
 def _rows_of_one_robot(session: Session, views: AbstractSet[int]) -> list[int]:
-    """The places of all rows of the robot that some views of a whole cell are of.
+    """The places of all rows with the state of the robot that some views of a whole cell are of.
 
     Raises:
-        DataError: They are of several robots.
+        DataError: They are of several robots, or of none.
     """
-    names = [name_of(session.declaration, "robot", view) for view in session.views]
-    robots = {name for name, view in zip(names, session.views, strict=True) if view.number in views}
-    if len(robots) > 1 or "" in robots:
+    names = {
+        at: name_of(session.declaration, "robot", view)
+        for at, view in enumerate(session.views)
+        if has_robot_state(view)
+    }
+    robots = {name for at, name in names.items() if session.views[at].number in views}
+    if len(robots) != 1:
         raise DataError(
             f"Views {ranges(views)} of session {session.name!r} are not all of one robot: the rows "
-            f"of {some_of(sorted(filter(None, robots))) or 'no robot'} cannot be shifted together.",
+            f"of {some_of(sorted(robots)) or 'no robot'} cannot be shifted together.",
             culprits=["--shift"],
-            next_step="Name the views of one robot's rows (column robot of views.csv).",
+            next_step="Name views of one robot's rows with poses (column robot of views.csv).",
         )
-    return [at for at, name in enumerate(names) if name in robots]
+    return [at for at, name in names.items() if name in robots]
 
 
 def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -> Session:

@@ -138,7 +138,7 @@ def _in_order(places: FloatArray, count: int) -> tuple[str, IntArray, IntArray] 
     where neither is clear.
     """
     rows = len(places)
-    if rows % count or rows == count:
+    if rows % count or rows == count or rows > _MOST_POINTS * count:
         return None
     several, at = rows // count, np.arange(rows)
     orders = {
@@ -155,6 +155,8 @@ def _in_order(places: FloatArray, count: int) -> tuple[str, IntArray, IntArray] 
     return best, *orders[best]
 
 
+# Most points of a thing at a stop: thousands are a surface that was scanned.
+_MOST_POINTS = 60
 # Fewest points whose places are a pose, and the least share of their extent off a line.
 _OF_A_POSE, _OFF_LINE = 3, 0.05
 

@@ -13,7 +13,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.choices import MOUNTS
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
-from visioncal.core.number_format import known_name
+from visioncal.core.number_format import known_name, some_of
 from visioncal.core.types import Progress
 from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.bags import BAG
@@ -183,8 +183,20 @@ def _reread(
     """The session in the chosen reading, of a whole cell robot by robot; raises DataError."""
     if not is_whole_cell(doubtful.session):
         return reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
+    reread_robots = set[str]()
     for of_robot in doubtful_robots(doubtful, progress):
-        doubtful = reread_robot(doubtful, of_robot, choose(of_robot))
+        chosen = choose(of_robot)
+        doubtful = reread_robot(doubtful, of_robot, chosen, mirrors_poses=mirrors_poses)
+        reread_robots.add(of_robot.robot)
+    # Numbers in another form are no poses until a reading makes them some.
+    untested = {*doubtful.session.robots} - reread_robots if doubtful.robot is not None else set()
+    if untested:
+        raise DataError(
+            f"Nothing was written: the poses of robot {some_of(sorted(untested))} are in another "
+            "form, and too few views test how they are read.",
+            culprits=sorted(untested),
+            next_step="Write its rotations as qx, qy, qz, qw, or add views that show a target.",
+        )
     return doubtful.session
 
 

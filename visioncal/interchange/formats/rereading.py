@@ -46,7 +46,7 @@ from visioncal.session.columns import (
     POSE,
     joint_columns,
 )
-from visioncal.session.kinds import name_of
+from visioncal.session.kinds import has_robot_state, name_of
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
 
@@ -244,14 +244,7 @@ def reread(
     """
     session = doubtful.session
     changes: tuple[str, ...] = ()
-    if candidate.hypothesis.robot.mirrored and not mirrors_poses:
-        raise DataError(
-            "Nothing was written: mirrored images are the usual cause, and then the robot's poses "
-            "are right.",
-            culprits=[candidate.words],
-            next_step="Turn the images back, and find their corners anew; only where the robot's "
-            "frame is left-handed, mirror its poses with --mirror-poses.",
-        )
+    _refuse_mirrored(candidate, mirrors_poses=mirrors_poses)
     _refuse_lost(candidate)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     camera = doubtful.camera or numbers_in(session, MEASURED_CAM_POSE)
@@ -308,28 +301,38 @@ def doubtful_robots(
     """
     session = doubtful.session
     run = measured_run(session, progress)
-    poses = {view.number: view.base_from_flange() for view in session.views}
-    known = {number: pose.as_matrix() for number, pose in poses.items() if pose is not None}
+    places = {view.number: at for at, view in enumerate(session.views)}
     for robot in session.robots:
+        # A robot's pose may stand in another row of the stop.
+        of_views = {
+            one.view.number: one.robots[robot]
+            for one in session.observations
+            if robot in one.robots
+        }
+        poses = {view: row.base_from_flange() for view, row in of_views.items()}
+        known = {view: pose.as_matrix() for view, pose in poses.items() if pose is not None}
         wrong, right = open_pairs(run, robot, known)
         if not wrong:
             continue
-        sound = {view for pair in right for view in pair.poses}
-        of_robot = [
-            at
-            for at, view in enumerate(session.views)
-            if name_of(session.declaration, "robot", view) == robot and view.number not in sound
-        ]
-        part = of_pair(run, robot, wrong[0])
-        numbers, rows = doubtful.robot, {view.number: at for at, view in enumerate(session.views)}
+        sound = {of_views[view].number for pair in right for view in pair.poses if view in of_views}
+        of_robot = (
+            view.number
+            for view in session.views
+            if name_of(session.declaration, "robot", view) == robot and has_robot_state(view)
+        )
+        part, numbers = of_pair(run, robot, wrong[0]), doubtful.robot
         if numbers is not None:
-            numbers = numbers.rows(np.array([rows[view.number] for view in part.session.views]))
-        views = frozenset(session.views[at].number for at in of_robot)
-        yield DoubtfulRobot(robot, part, views, numbers)
+            rows = (of_views.get(view.number, view).number for view in part.session.views)
+            numbers = numbers.rows(np.array([places[row] for row in rows]))
+        yield DoubtfulRobot(robot, part, frozenset(of_robot) - sound, numbers)
 
 
 def reread_robot(
-    doubtful: DoubtfulSession, of_robot: DoubtfulRobot, candidate: Candidate
+    doubtful: DoubtfulSession,
+    of_robot: DoubtfulRobot,
+    candidate: Candidate,
+    *,
+    mirrors_poses: bool = False,
 ) -> DoubtfulSession:
     """Applies a reading to the poses of one robot of a whole cell; noted in `corrected`.
 
@@ -337,10 +340,12 @@ def reread_robot(
         DataError: The reading changes more than this robot's poses.
     """
     session, robot = doubtful.session, of_robot.robot
+    whose = f"robot {robot}" if robot else "the robot"
     _refuse_lost(candidate)
-    if candidate.hypothesis.robot.mirrored or not candidate.is_of_robot:
+    _refuse_mirrored(candidate, mirrors_poses=mirrors_poses)
+    if not candidate.is_of_robot:
         raise DataError(
-            f"Robot {robot}: the chain closes with {candidate.words}, which changes more than the "
+            f"The chain of {whose} closes with {candidate.words}, which changes more than the "
             "poses of this robot: nothing was written.",
             culprits=[candidate.words],
             next_step="Of several robots or cameras, correct the files by hand.",
@@ -351,17 +356,32 @@ def reread_robot(
     corrected = candidate.hypothesis.robot.corrected(numbers.rows(np.array(rows)))
     _replace_cells([cells[at] for at in rows], pose_cells(corrected, POSE), POSE)
     document, words = {**session.document}, candidate.words
-    if table := _robot_table(doubtful, candidate, robot).get("robot"):
+    table = _robot_table(doubtful, candidate, robot).get("robot")
+    if table and robot:
         document["robots"] = {**document["robots"], robot: table}
+    elif table:
+        document["robot"] = table
     # Another form of the same numbers, which the columns show, is no change.
     is_other = bool(candidate.hypothesis.changes)
-    changes = (f"Poses of robot {robot} are read otherwise than at first: {words}.",) * is_other
+    changes = (f"Poses of {whose} are read otherwise than at first: {words}.",) * is_other
     changed = session.with_content(
         document=noting(session, document, changes),
         cells=[[row[name] for name in session.columns] for row in cells],
     )
     read = replace(changed, warnings=tuple(dict.fromkeys((*changes, *session.warnings))))
     return replace(doubtful, session=read)
+
+
+def _refuse_mirrored(candidate: Candidate, *, mirrors_poses: bool) -> None:
+    """Refuses a reading that mirrors the poses, unless that is asked for; raises DataError."""
+    if candidate.hypothesis.robot.mirrored and not mirrors_poses:
+        raise DataError(
+            "Nothing was written: mirrored images are the usual cause, and then the robot's poses "
+            "are right.",
+            culprits=[candidate.words],
+            next_step="Turn the images back, and find their corners anew; only where the robot's "
+            "frame is left-handed, mirror its poses with --mirror-poses.",
+        )
 
 
 def _refuse_lost(candidate: Candidate) -> None:
