@@ -434,6 +434,29 @@ POINTS = (
 TRACKERS = (InstrumentAt("t1", (0.0, -3.0, 1.2)), InstrumentAt("t2", (0.5, 3.0, 1.2), 2.5))
 
 
+def test_readings_of_points_that_are_off_at_some_stops_are_wrong_readings():
+    """A single place shows no motion of the tracker: they are left out one by one."""
+    points = tuple(
+        replace(POINTS[-2], name=f"p{at}", place_m=(0.05, 0.03 * at, 0.08)) for at in (0, 1, 2)
+    )
+    options = NetworkOptions(
+        robots=ROBOTS[:1], cameras=(CameraAt("hand", on="a"),), boards=(FLOOR,),
+        instruments=TRACKERS[:1], points=points, stops=14,
+    )  # fmt: skip
+    cell = simulate(options)
+    session = cell_session(cell, "cell", seen="poses")
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    off = set[int]()
+    for view, row in zip(session.views, cells, strict=True):
+        if row["meas_x_m"] and view.stop in (3, 7, 11):
+            row["meas_x_m"] = str(float(row["meas_x_m"]) + 0.02)
+            off.add(view.number)
+    rows = [[row[name] for name in session.columns] for row in cells]
+    found = calibrate(session.with_content(document=session.document, cells=rows))
+    assert {view.view for view in found.views if not view.used} == off
+    assert {cause.kind for cause in found.verdict.causes} == {"wrong_views"}
+
+
 @pytest.mark.slow
 def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera():
     cell = simulate(NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12))

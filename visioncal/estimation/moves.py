@@ -198,13 +198,14 @@ def find_move(
     Of a frame that creeps, where that explains more, the stop is -1. A pushed robot base is no
     move: its observations stay outliers. `agrees` is the (n,) inlier mask.
     """
-    bases = _unknown_bases(problem)
+    bases, is_oriented = _unknown_bases(problem), problem.observations.directions > 3
     found = []
     for frame in (*movable, *bases):
         rows = problem.observations.involves(frame)
         if frame in bases:
             rows = observations_over(problem, fit, frame)
-        if np.sum(~agrees[rows]) >= FEWEST_VIEWS:
+        # A single place shows no pose, and no change of one.
+        if np.sum(~agrees[rows]) >= FEWEST_VIEWS and is_oriented[rows].all():
             found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
             may_creep = frame not in bases and may_have_crept(problem, frame)
             crept = find_creep(problem, fit, agrees, frame) if may_creep else None
