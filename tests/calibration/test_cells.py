@@ -347,8 +347,23 @@ def test_rows_without_a_pose_stay_where_those_of_their_robot_are_shifted():
 def test_a_sound_cell_stays_as_it_is_where_other_readings_are_tried(tmp_path, monkeypatch, three):
     monkeypatch.chdir(tmp_path)
     three.save("cell")
-    visioncal("convert", "cell", "copy", "--guess", "--yes").good()
+    said = visioncal("convert", "cell", "copy", "--guess", "--yes").good().said
+    assert "note: The poses of each robot that enough views test fit as first read." in said
     assert Session.load("copy").digest() == Session.load("cell").digest()
+
+
+@pytest.mark.slow
+def test_a_robot_that_no_reading_mends_leaves_the_other_one_to_be_mended(
+    tmp_path, monkeypatch, three
+):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    turns = iter(exp(rng.normal(size=(200, 6))))
+    misread(three, {"a": in_mm, "b": lambda matrix: matrix @ next(turns)}).save("cell")
+    said = visioncal("convert", "cell", "cell-fixed", "--guess", "--yes").good().said
+    assert "note: Poses of robot b stay as they are: no reading stands out." in said
+    (note,) = Session.load("cell-fixed").declaration.corrected
+    assert note.startswith("Poses of robot a are read otherwise than at first: ")
 
 
 @pytest.mark.slow

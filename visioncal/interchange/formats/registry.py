@@ -183,11 +183,18 @@ def _reread(
     """The session in the chosen reading, of a whole cell robot by robot; raises DataError."""
     if not is_whole_cell(doubtful.session):
         return reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
-    reread_robots = set[str]()
+    reread_robots, refused = set[str](), dict[str, DataError]()
     for of_robot in doubtful_robots(doubtful, progress):
-        chosen = choose(of_robot)
+        try:
+            chosen = choose(of_robot)
+        except DataError as error:
+            # Another robot's poses are mended nevertheless.
+            refused[of_robot.robot] = error
+            continue
         doubtful = reread_robot(doubtful, of_robot, chosen, mirrors_poses=mirrors_poses)
         reread_robots.add(of_robot.robot)
+    if refused and not reread_robots:
+        raise next(iter(refused.values()))
     # Numbers in another form are no poses until a reading makes them some.
     untested = {*doubtful.session.robots} - reread_robots if doubtful.robot is not None else set()
     if untested:
@@ -197,7 +204,10 @@ def _reread(
             culprits=sorted(untested),
             next_step="Write its rotations as qx, qy, qz, qw, or add views that show a target.",
         )
-    return doubtful.session
+    notes = [f"Poses of robot {name} stay as they are: no reading stands out." for name in refused]
+    if not reread_robots:
+        notes.append("The poses of each robot that enough views test fit as first read.")
+    return replace(doubtful.session, warnings=(*doubtful.session.warnings, *notes))
 
 
 def _checked(
