@@ -26,7 +26,8 @@ from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
 from visioncal.calibration.suspects.lens import pane_finding
-from visioncal.calibration.suspects.outliers import _changed_words, farthest_by_arms
+from visioncal.calibration.suspects.moved_views import _changed_words
+from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting, rank_causes
 from visioncal.core.codec import read, write
 from visioncal.core.conventions import PoseNumbers

@@ -25,8 +25,8 @@ from visioncal.calibration.stages.likely_steps import steps_of, with_free_sizes
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
+from visioncal.calibration.suspects.moved_views import PoseFault
 from visioncal.calibration.suspects.outliers import (
-    PoseFault,
     explained_outliers,
     movements,
     versions,

@@ -31,7 +31,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.random_effects import random_effects
 from visioncal.calibration.stages.refine import refine_jointly
-from visioncal.calibration.suspects.outliers import views_apart
+from visioncal.calibration.suspects.moved_views import views_apart
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION

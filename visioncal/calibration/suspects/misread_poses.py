@@ -30,8 +30,8 @@ from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.late_poses import by_joints
 from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
+from visioncal.calibration.suspects.moved_views import IN_MOTION
 from visioncal.calibration.suspects.other_rows import of_other_rows
-from visioncal.calibration.suspects.outliers import IN_MOTION
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError

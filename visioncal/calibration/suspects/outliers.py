@@ -1,31 +1,22 @@
 """Messages on outliers and moved frames: exchanged or wrong observations, by cause."""
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 
 import numpy as np
 
-from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_names, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
-from visioncal.core.number_format import figure, listed, mm_and_deg, ranges, some_of, view_words
+from visioncal.calibration.suspects.moved_views import PoseFault, fault_of, of_moved, pushed_base
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import figure, listed, some_of, view_words
 from visioncal.core.transforms import (
-    exp,
-    invert,
-    log,
     pose_difference,
-    rotation_angle,
 )
-from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
-from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
-from visioncal.estimation.moves import find_push, observations_over
-from visioncal.estimation.outliers import InlierFit
-from visioncal.estimation.steps import step_of
+from visioncal.core.types import IntArray
+from visioncal.core.verdict import CALIBRATE, Remedy, mending
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import frame_name, object_name
@@ -36,41 +27,12 @@ EXCHANGED, MISNAMED = "exchanged_views", "misnamed_rows"
 # Rows that no chance has fit another name.
 _FEWEST_MISNAMED = 2
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
-# Views among many outliers of one end that agree by chance, one of so many; what a step that few
-# times exceeds the noise leaves of these, and poses that are wrong apart never do.
-_BY_CHANCE, _AT_END = 4, 0.6
-# Probability below which outliers that are all views of one end are so by no chance.
-_ONE_END = 1e-3
 _WRONG = "its pose or its reading is wrong, or something had moved"
 # An arm's errors have longer tails than noise: views within so many times the limit of outliers, at
 # most one to so many that agree, are no mistakes where arms err by as much.
 _MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
-# A knock moves what is fastened by less [mm, deg].
-_KNOCKED = 20.0, 5.0
-# Of views before or after a frame of the controller was switched.
-OF_OTHER_FRAMES = ": their result is for the tool and the base frame that were active there"
-# Another size turns nothing, and a small marker's noise less than so [rad].
-_TURNED_RAD = 0.2
-# Largest share of the way to another stop at which an arm is, and least share of outliers for which
-# that holds: one in hundreds is along that line by chance.
-_ON_THE_WAY, _MOST_ON_THE_WAY = 0.4, 0.6
-IN_MOTION = Remedy(
-    "Wait until the arm stands still before each image, and log the measured pose then; or record "
-    "times of images and of a stream of poses (stamp_s, streams): then the delay is estimated."
-)
-# Errors of an arm as a twist [rad].
-_ARM_LEAVES = float(np.hypot(1e-3 * _ARM_ERRS[0] / LEVER_M, np.deg2rad(_ARM_ERRS[1])))
-
-
-@dataclass(frozen=True)
-class PoseFault:
-    """A fault of poses or images that explains outliers."""
-
-    found: Finding  # The finding.
-    rows: tuple[int, ...]  # The observations that it explains.
-    short: str = ""  # The fault as a clause, for each of these; empty where the finding suffices.
 
 
 def versions(cell_fit: CellFit) -> dict[str, str]:
@@ -133,179 +95,12 @@ def explained_outliers(
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
     if cell_fit.cell.mount is not None and not faults:
-        # One change of a frame explains a push along the motion, too.
-        alike = _end_run(cell_fit).change or _common_change(
-            agreed, outliers, 1.0 / CLEAR_RATIO, _ARM_LEAVES
-        )
-        on_the_way = [*_in_motion(cell_fit, outliers)] if alike is None else []
-        faults += on_the_way or _moved_run(cell_fit)
+        faults += of_moved(cell_fit, outliers)
     if cell_fit.cell.mount is None and not faults:
-        faults += [*_misnamed(cell_fit, outliers)] or _pushed_base(cell_fit)
+        faults += [*_misnamed(cell_fit, outliers)] or pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, circles) for at in outliers.tolist()} | clauses
     return tuple(faults), *_reasons(cell_fit, causes)
-
-
-def _fault(
-    cell_fit: CellFit, kind: str, rows: Sequence[int], words: str, do: Remedy, short: str = ""
-) -> PoseFault:
-    """A fault of some observations, in words in which {views} are theirs."""
-    views = tuple(cell_fit.cell.rows[row].view for row in rows)
-    words = words.format(views=view_words(views))
-    found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
-    return PoseFault(found, tuple(rows), short)
-
-
-def _in_motion(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
-    """Outliers at which the arm was on its way from the last stop, or to the next one."""
-    inliers, part = cell_fit.inlier_fit, cell_fit.inlier_fit.problem
-    (poses, *others), stops = part.poses.values(), part.observations.stops[outliers]
-    known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
-    linear = part.linear(inliers.fit.state)
-    noise = part.total_covariance(linear, inliers.fit.noise)[outliers]
-    if others or len(outliers) < FEWEST_VIEWS or not noise.any():
-        return
-    residuals, by_flange = linear.residuals[outliers], linear.by_flanges[outliers]
-    at, found = np.searchsorted(known, stops), list[tuple[int, bool, IntArray, FloatArray]]()
-    for by in (-1, 1):
-        other = known[np.clip(at + by, 0, len(known) - 1)]
-        ways = log(invert(poses[stops]) @ poses[other])
-        # Most programs have a tool move along a line.
-        ways[:, 3:] = np.einsum(
-            "nji,nj->ni", poses[stops][:, :3, :3], poses[other][:, :3, 3] - poses[stops][:, :3, 3]
-        )
-        moved = (by_flange @ ways[:, :, None])[:, :, 0]
-        white = np.linalg.solve(noise, np.stack([residuals, moved], axis=2))
-        before, cross, square = (
-            np.einsum("ni,ni->n", *pair)
-            for pair in (
-                (residuals, white[:, :, 0]),
-                (moved, white[:, :, 0]),
-                (moved, white[:, :, 1]),
-            )
-        )
-        shares = -cross / np.maximum(square, np.finfo(float).tiny)
-        left = before - shares**2 * square
-        explained = (CLEAR_RATIO**2 * left < before) & (np.abs(shares) < _ON_THE_WAY)
-        for is_beyond in (False, True):
-            rows = np.flatnonzero(explained & ((shares < 0.0) == is_beyond))
-            found.append((by, is_beyond, rows, np.abs(shares[rows])))
-    by, is_beyond, rows, shares = max(found, key=lambda item: len(item[2]))
-    if len(rows) < max(FEWEST_VIEWS, _MOST_ON_THE_WAY * len(outliers)):
-        return
-    which = "last" if by < 0 else "next"
-    when = {
-        (
-            -1,
-            False,
-        ): "the image was taken before the arm had arrived, as of commanded poses",
-        (-1, True): "the pose was read before the arm had arrived",
-        (1, False): "the image was taken once the arm had left",
-        (1, True): "the pose was read once the arm had left",
-    }[by, is_beyond]
-    low, high = (figure(100.0 * float(share)) for share in (shares.min(), shares.max()))
-    how = f"by {low}{f' to {high}' * (low != high)} % of the way to the {which} stop"
-    short = f"the arm moved between image and pose, {how}"
-    words = f"{{views}} were left out: {short}, along the line between both: {when}."
-    yield _fault(cell_fit, "something_moved", outliers[rows].tolist(), words, IN_MOTION, short)
-
-
-@dataclass(frozen=True, eq=False)
-class _EndRun:
-    """Outliers that are the views at one end of the session."""
-
-    rows: IntArray  # The outliers there.
-    order: IntArray  # (n,) all observations in the order of their stops.
-    at: int  # Place among these of the first observation after the change.
-    is_first: bool  # Whether it is the end before.
-    change: tuple[str, FloatArray] | None  # Common to these; see `_common_change`.
-
-    @property
-    def later(self) -> IntArray:
-        """Observations after the change, in the session's order."""
-        return np.sort(self.order[self.at :])
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether all views of this end are out."""
-        return len(self.rows) == (self.at if self.is_first else len(self.order) - self.at)
-
-
-def _end_run(cell_fit: CellFit) -> _EndRun:
-    inliers = cell_fit.inlier_fit
-    order = np.argsort(inliers.problem.observations.stops, kind="stable")
-    is_used = inliers.used[order]
-    ends = np.append(0, np.cumsum(np.where(is_used, -_BY_CHANCE, 1)))
-    first, last = int(ends.argmin()), int(ends.argmax())
-    before, after = order[:last][~is_used[:last]], order[first:][~is_used[first:]]
-    is_first = len(before) > len(after)
-    run, at = (before, last) if is_first else (after, first)
-    most = _AT_END if len(run) > FEWEST_VIEWS else 1.0 / CLEAR_RATIO
-    change = _common_change(inliers, run, most) if len(run) >= FEWEST_VIEWS else None
-    return _EndRun(run, order, at, is_first, change)
-
-
-def views_apart(cell_fit: CellFit) -> frozenset[int]:
-    """Views of one end of the session of which camera, target or a frame was another one."""
-    if cell_fit.cell.mount is None or cell_fit.inlier_fit.used.all():
-        return frozenset()
-    run = _end_run(cell_fit)
-    if run.change is None:
-        return frozenset()
-    return frozenset(cell_fit.cell.rows[row].view for row in run.rows.tolist())
-
-
-def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers that are the views at one end of the session and agree, as where something moved."""
-    inliers, rows, found = cell_fit.inlier_fit, cell_fit.cell.rows, _end_run(cell_fit)
-    run, change, order = found.rows, found.change, found.order
-    is_used = inliers.used[order]
-    words = "Fasten camera and target, keep one board, and one tool and base frame in the "
-    words += "controller, and record again"
-    if cell_fit.cell.mount == "instrument":
-        words = "Leave the instrument where it stands and one probe in one nest, and record again"
-    if len(run) == np.sum(~is_used) and found.is_whole:
-        # All views of one end and no others: by another pose of each, that is hardly chance.
-        by_chance = 2.0 * len(order) / math.comb(len(order), len(run))
-        change = change or (("", np.eye(4)) if by_chance < _ONE_END else None)
-    if change is not None:
-        # Picks come after the session.
-        later = [rows[row].view for row in found.later.tolist()]
-        when = f"{'before' if found.is_first else 'from'} view {rows[int(order[found.at])].view}"
-        when += " on" * (not found.is_first)
-        which = "from there on" if found.is_first else "before"
-        kept = f" The result is that of the views {which}."
-        words += f"; or calibrate the {len(later)} views from there on alone"
-        is_far = pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]
-        note = OF_OTHER_FRAMES * is_far
-        do = or_alone(f"{words}{note}.", later)
-        if is_switched(change[1]):
-            these = [rows[row].view for row in np.sort(run).tolist()]
-            otherwise = f"{words[0].lower()}{words[1:]} (--views {ranges(later)}){note}."
-            do = _tool_taken_off(cell_fit, change, these, otherwise) or do
-    else:
-        # Views here and there, as of every second row.
-        run, when = order[~is_used], "in all of these"
-        most = 1.0 / CLEAR_RATIO
-        if len(run) < FEWEST_VIEWS:
-            return
-        # Of views here and there, wrong poses alike by chance are no frame.
-        if (change := _common_change(inliers, run, most, _ARM_LEAVES)) is None:
-            return
-        run, change = _alike(inliers, np.sort(run), *change)
-        some = [rows[row].view for row in run.tolist()]
-        words += ". The result is that of the other views; calibrate these alone, too."
-        otherwise = "the result is that of the other views."
-        do = _tool_taken_off(cell_fit, change, some, otherwise) or or_alone(words, some)
-        kept = ""
-    what, how = _changed_words(cell_fit, *change)
-    outliers = np.sort(run).tolist()
-    if cell_fit.may_be_of_arms(change[1]):
-        how += OTHER_POSTURE
-    elif change[0] and np.less(pose_difference(np.eye(4), change[1]), _ARM_ERRS).all():
-        how += ", or another load bends the arm"
-    words = f"{{views}} were left out: {when}, {what} was another one{how}.{kept}"
-    yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
 
 
 def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
@@ -332,161 +127,7 @@ def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     short = "the name of its camera or of its target is another one's"
     words = f"{{views}} were left out: they fit with {named}, as rows with exchanged names do."
     do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
-    yield _fault(cell_fit, MISNAMED, every, words, do, short)
-
-
-def _pushed_base(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers from some stop on that agree on one other pose of a robot's base."""
-    inliers, cell = cell_fit.inlier_fit, cell_fit.cell
-    push = find_push(inliers.problem, inliers.fit, inliers.used)
-    if push is None:
-        return
-    (base, stop, change), stops = push, inliers.problem.observations.stops
-    is_over = observations_over(inliers.problem, inliers.fit, base)
-    out = np.flatnonzero(is_over & ~inliers.used & (stops >= stop))
-    last = cell.stops[stops[is_over & (stops < stop)].max()]
-    moved = mm_and_deg(*pose_difference(np.eye(4), exp(change)))
-    words = (
-        f"between stops {last} and {cell.stops[stop]}, {base} moved by {moved}. The result has it "
-        "where it stood first: {views}, later, were left out."
-    )
-    do = cell.or_separately(f"Fasten {base}", stop)
-    yield _fault(cell_fit, "something_moved", out.tolist(), words, do, f"{base} had moved")
-
-
-def _tool_taken_off(
-    cell_fit: CellFit, change: tuple[str, FloatArray], views: Sequence[int], otherwise: str
-) -> Remedy | None:
-    """Advice by a change that some views have in common; see `tool_taken_off`."""
-    frame, step = change
-    if not frame:
-        return None
-    edge = cell_fit.fit.frames[frame]
-    return tool_taken_off(cell_fit, frame, (edge, edge @ step), views, otherwise)
-
-
-def tool_taken_off(
-    cell_fit: CellFit,
-    frame: str,
-    edges: tuple[FloatArray, FloatArray],
-    views: Sequence[int],
-    otherwise: str,
-) -> Remedy | None:
-    """Advice to take a tool off some views' poses; None where another frame was another one.
-
-    Args:
-        cell_fit: The fit.
-        frame: The frame that was another one in these views.
-        edges: What it is in the other views, and in these.
-        views: The views.
-        otherwise: What to do where no tool was active.
-    """
-    on_camera = "cam" if cell_fit.cell.mount == "eye-in-hand" else "target"
-    # Joint angles that belong to the poses rule a tool out.
-    has_joints = any(arm.matched is not None for arm in cell_fit.arms.values())
-    mount = cell_fit.cell.mount
-    if has_joints or not frame.startswith(on_camera) or mount in (None, "instrument"):
-        return None
-    tool = edges[0] @ invert(edges[1])
-    twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
-    numbers = ",".join(f"{value:.4f}" for value in twist)
-    done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
-    first = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
-    return replace(done, words=f"{first} Else {otherwise}")
-
-
-def is_switched(step: FloatArray) -> bool:
-    """Whether a frame of the controller is likelier another one than that something was knocked.
-
-    A knock moves what is fastened by millimetres.
-    """
-    return bool(np.greater(pose_difference(np.eye(4), step), _KNOCKED).any())
-
-
-def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
-    """The frame that moved from some view on, and by how much, in words."""
-    if not frame:
-        known = any(arm.matched is not None for arm in cell_fit.arms.values())
-        joint = ", or the zero of a joint," if known else ""
-        moved = mm_and_deg(*pose_difference(np.eye(4), step))
-        how = f": by about {moved}" if np.any(step != np.eye(4)) else ""
-        return f"the camera, the target or a frame of the controller{joint}", how
-    thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]
-    on_flange = (cell_fit.cell.mount == "eye-in-hand") == (thing == "camera")
-    if cell_fit.cell.mount == "instrument":
-        on_flange = not frame.startswith("instrument")
-        thing = "probe" if on_flange else "instrument"
-    of_robot = f"controller's {'tool' if on_flange else 'base frame'}"
-    mm, deg = pose_difference(np.eye(4), step)
-    moved = mm_and_deg(mm, deg) if deg else f"{figure(mm)} mm"
-    how = f": the {thing} by {moved}, or the {of_robot} by {other_frame(edge, edge @ step)}"
-    return f"the {thing} or the {of_robot}", how
-
-
-def other_frame(before: FloatArray, after: FloatArray) -> str:
-    """Where poses of another tool, or in another frame, have it: an edge is another one by it."""
-    other = before @ invert(after)
-    x, y, z = (figure(1e3 * part) for part in other[:3, 3].tolist())
-    return f"({x}, {y}, {z}) mm and {figure(pose_difference(np.eye(4), other)[1])} deg"
-
-
-def _common_change(
-    inliers: InlierFit, rows: IntArray, most: float, leaves: float = np.inf
-) -> tuple[str, FloatArray] | None:
-    """The frame whose step explains most of some outliers, and the step; None where none does.
-
-    It leaves a third of them; up to `most`, as a share, where that is as much as others scatter by;
-    and no more than `leaves` [rad], or than others scatter by.
-
-    Its name is empty where another size of the target does, or steps of several frames alike. Rows
-    with other poses, or of other images, have none in common.
-    """
-    some, state = np.isin(np.arange(len(inliers.problem)), rows), inliers.fit.state
-    part, others = inliers.problem.subset(some), inliers.part
-    are_places = not part.observations.has_rotation.all()
-    if are_places and len(part) < FEWEST_STOPS:
-        most = 1.0 / CLEAR_RATIO**2
-    both = part.measured(state), part.predicted(state)
-    turned = float(np.median(rotation_angle(invert(both[0]) @ both[1])))
-    measured, predicted = (poses[:, :3, 3] for poses in both)
-    sizes = np.sum(measured * (predicted - measured), axis=1) / np.sum(measured**2, axis=1)
-    of_size = float(np.ptp(sizes) / max(abs(np.median(sizes)), np.finfo(float).tiny))
-    found = list[tuple[float, str, FloatArray]]()
-    for frame in filter(lambda name: part.observations.involves(name).all(), part.unknown):
-        # Rigid motions explain much of a few places.
-        if are_places and len(part) < FEWEST_STOPS and frame.startswith("instrument"):
-            continue
-        step, away = step_of(part, frame, state)
-        usually = step_of(others, frame, state, np.eye(4))[1]
-        size = np.linalg.norm(log(step) / TWIST_UNITS)
-        left, usual = np.median(away), np.median(usually)
-        # Poses that are wrong may have much in common, and differ by far more than noise.
-        is_noise = CLEAR_RATIO * left < size or left < CLEAR_RATIO * usual
-        is_noise &= bool(left < max(leaves, CLEAR_RATIO * usual))
-        found.append((float(left / size) if is_noise else np.inf, frame, step))
-    ratio, frame, step = min(found, default=(np.inf, "", np.eye(4)), key=lambda item: item[0])
-    # A tool that is longer along the line of sight looks like another size, too.
-    is_size = CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio) and turned < _TURNED_RAD
-    if not are_places and is_size:
-        return "", np.eye(4)
-    if ratio >= most:
-        return None
-    is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
-    return (frame if is_alone else ""), step
-
-
-def _alike(
-    inliers: InlierFit, rows: IntArray, frame: str, step: FloatArray
-) -> tuple[IntArray, tuple[str, FloatArray]]:
-    """Outliers among (n,) that a step of a frame explains, and this step by them alone."""
-    if not frame:
-        return rows, (frame, step)
-    every, state = np.arange(len(inliers.problem)), inliers.fit.state
-    part = inliers.problem.subset(np.isin(every, rows))
-    away = step_of(part, frame, state, step)[1]
-    rows = rows[CLEAR_RATIO * away < np.linalg.norm(log(step) / TWIST_UNITS)]
-    part = inliers.problem.subset(np.isin(every, rows))
-    return rows, (frame, step_of(part, frame, state)[0])
+    yield fault_of(cell_fit, MISNAMED, every, words, do, short)
 
 
 def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[PoseFault]:
@@ -508,7 +149,7 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
             short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
             words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
             do = _exchange(cell_fit, at_both, stations)
-            yield _fault(cell_fit, EXCHANGED, at_both, words, do, short)
+            yield fault_of(cell_fit, EXCHANGED, at_both, words, do, short)
             pairs = [pair for pair in pairs if pair[0] not in at_both]
     if not pairs:
         return
@@ -531,7 +172,7 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
     )
     typed = ",".join(f"{first},{second}" for first, second in views)
     do = mending(f"their {shown}s are exchanged", f"--exchange {typed}")
-    yield _fault(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
+    yield fault_of(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
 
 
 def _exchange(cell_fit: CellFit, rows: Sequence[int], stations: Sequence[int]) -> Remedy:
@@ -563,7 +204,7 @@ def _exchanged_in_turn(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> P
         "the next one's row. They were left out."
     )
     do = mending(f"their {shown}s are exchanged", f"--exchange {','.join(typed)}")
-    return _fault(cell_fit, EXCHANGED, sorted(chain.from_iterable(circles)), text, do)
+    return fault_of(cell_fit, EXCHANGED, sorted(chain.from_iterable(circles)), text, do)
 
 
 def _shown(cell_fit: CellFit) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE
-from visioncal.calibration.suspects.outliers import (
+from visioncal.calibration.suspects.moved_views import (
     OF_OTHER_FRAMES,
     is_switched,
     other_frame,
