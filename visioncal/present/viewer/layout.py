@@ -41,8 +41,9 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     # A legend would cover the marks at the top and bottom, which are of these views; a longer title
     # would be cut off.
     legend = "; red: not used" if not all(view.used for view in views) else ""
-    curves = [
-        [
+
+    def curves_of(seer: str) -> list[rrb.View]:
+        return [
             rrb.TimeSeriesView(
                 name=f"{seer}: {name}{legend}" if seer else f"{name}{legend}",
                 origin=paths.part_of(plot, seer),
@@ -51,8 +52,7 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
             )
             for name, plot in plots.items()
         ]
-        for seer in seers
-    ]
+
     things = [*_THINGS, *(f"{thing}s" for thing in _THINGS), paths.STOPS]
     things += [paths.FRAMES, paths.SEEN_TARGET, paths.CELL]
     frame = paths.BASE_FRAME if cell is None else paths.CELL_FRAME
@@ -64,8 +64,10 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         "Cell", things, _eye_on(places) if len(places) > 2 else None, frame, has_image=has_images
     )
     if cell is None:
-        # The residuals of one camera fit below the cell, those of several have a tab.
-        few = rrb.Horizontal(*curves[0][:1], *curves[0][1:][-1:])
+        # The residuals of one camera fit below the cell, those of several have a tab. A view has
+        # one container: the tab has others.
+        curves = curves_of(next(iter(seers)))
+        few = rrb.Horizontal(*curves[:1], *curves[1:][-1:])
         left = rrb.Vertical(left, few, row_shares=[3, 1])
     verdict: rrb.Container | rrb.View = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
     if calibration is not None:
@@ -89,7 +91,8 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     overview = rrb.Horizontal(
         left, rrb.Vertical(*right, row_shares=shares), name="Overview", column_shares=[1.2, 1]
     )
-    residuals = rrb.Vertical(*(rrb.Horizontal(*row) for row in curves), name="Residuals")
+    rows = (rrb.Horizontal(*curves_of(seer)) for seer in seers)
+    residuals = rrb.Vertical(*rows, name="Residuals")
     network = rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK)
     tabs = (overview, *((network,) if cell is not None else ()), residuals)
     return _with_panels(rrb.Tabs(*tabs, active_tab=0))
