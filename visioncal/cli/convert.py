@@ -9,7 +9,7 @@ from visioncal.cli.console import print_table, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import counted
+from visioncal.core.number_format import counted, robot_words
 from visioncal.interchange.formats import (
     DoubtfulRobot,
     DoubtfulSession,
@@ -87,7 +87,8 @@ def _chosen(recorded: DoubtfulSession | DoubtfulRobot, *, yes: bool) -> Candidat
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
     if isinstance(recorded, DoubtfulRobot):
-        say(f"Robot {recorded.robot}:" if recorded.robot else "The robot:")
+        words = robot_words(recorded.robot)
+        say(f"{words[0].upper()}{words[1:]}:")
     at = guess.candidates.index(guess.best)
     shown = guess.candidates[: max(_SHOWN, at + 1)]
     left = len(guess.candidates) - len(shown)

@@ -130,6 +130,11 @@ def view_words(views: Sequence[int]) -> str:
     return f"view{'s' * (len(views) > 1)} {some_of([*map(str, views)])}"
 
 
+def robot_words(name: str) -> str:
+    """A robot in a sentence: `robot a`, or `the robot` where it has no name."""
+    return f"robot {name}" if name else "the robot"
+
+
 def row_words(views: Sequence[int]) -> str:
     """All rows of views in a sentence: `the row of view 3`, or `the rows of views 3 and 6`."""
     s = "s" * (len(views) > 1)

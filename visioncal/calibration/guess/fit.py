@@ -324,8 +324,7 @@ def _mounted(flanges: FloatArray, read: FloatArray) -> FloatArray:
 def _least_squares(design: FloatArray, right: FloatArray) -> FloatArray:
     """(..., q) solutions of (..., n, q) equations; what these leave open is zero.
 
-    By the normal equations: singular values under 1e-6 of the largest, which are of directions that
-    millions of readings would determine no better, count as none.
+    By the normal equations, in which singular values under 1e-6 of the largest count as none.
     """
     across = np.swapaxes(design, -1, -2)
     inverse = np.linalg.pinv(across @ design, rcond=1e-12, hermitian=True)

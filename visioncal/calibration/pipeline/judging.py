@@ -69,24 +69,25 @@ def findings_of(run: RunState) -> Findings:
     frames = run.cell_fit.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
+    worst = _worst(run)
     return Findings(
         _pairs(connected, explained | answer.marginal, answer, alone=run.mount is not None),
         _sensors(connected, run),
         _arms(run),
-        _worst(run),
+        worst,
         (*contested(run, found_in(run)), *run.warnings),
         (*run.notes, *_marginal_words(answer)),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
         run.session.corrects_targets,
         _use(run),
-        _is_by_lens(run),
+        _is_by_lens(run, worst),
     )
 
 
-def _is_by_lens(run: RunState) -> bool:
+def _is_by_lens(run: RunState, worst: Sequence[Direction]) -> bool:
     """Whether most of the variance of the weakest direction is that of an estimated lens."""
-    fit, worst = run.assessment.fit, _worst(run)
+    fit = run.assessment.fit
     lens = fit.unknowns.of_kinds(LENS)
     is_estimated = any(look.table.stated is None for look in run.cameras.values())
     if run.mount is None or not (is_estimated and len(lens)):

@@ -36,7 +36,7 @@ from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, S
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO
-from visioncal.core.number_format import figure, ranges
+from visioncal.core.number_format import figure, ranges, robot_words
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import (
@@ -145,7 +145,7 @@ def with_undone(run: RunState) -> RunState:
             mistake = likeliest(of_pair(run, robot, pair))
             if mistake is None:
                 continue
-            whose = f"robot {robot}" if robot else "the robot"
+            whose = robot_words(robot)
             whose = f"{whose[0].upper()}{whose[1:]}, in its rows of {pair.camera} and {pair.target}"
             found, do = mistake.found, mistake.found.do
             if do is not None and "--views" in do.command:
@@ -196,7 +196,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         return
     for robot in (name for name in run.session.robots if name in run.robots):
         wrong, right = open_pairs(run, robot, run.robots[robot].base_from_flange)
-        whose = f"robot {robot}" if robot else "the robot"
+        whose = robot_words(robot)
         for pair in wrong:
             if (other := _on_another(run, robot, pair)) is not None:
                 yield other

@@ -99,10 +99,7 @@ def _in_motion(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
         return
     which = "last" if by < 0 else "next"
     when = {
-        (
-            -1,
-            False,
-        ): "the image was taken before the arm had arrived, as of commanded poses",
+        (-1, False): "the image was taken before the arm had arrived, as of commanded poses",
         (-1, True): "the pose was read before the arm had arrived",
         (1, False): "the image was taken once the arm had left",
         (1, True): "the pose was read once the arm had left",
@@ -159,9 +156,14 @@ def views_apart(cell_fit: CellFit) -> frozenset[int]:
     return frozenset(cell_fit.cell.rows[row].view for row in run.rows.tolist())
 
 
-def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers that are the views at one end of the session and agree, as where something moved."""
-    inliers, rows, found = cell_fit.inlier_fit, cell_fit.cell.rows, _end_run(cell_fit)
+def _moved_run(
+    cell_fit: CellFit, found: _EndRun, alike: tuple[str, FloatArray] | None
+) -> Iterator[PoseFault]:
+    """Outliers at one end of the session that agree, as where something moved, or here and there.
+
+    `alike` is the change that all outliers have in common, of those without one at an end.
+    """
+    inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
     run, change, order = found.rows, found.change, found.order
     is_used = inliers.used[order]
     words = "Fasten camera and target, keep one board, and one tool and base frame in the "
@@ -189,14 +191,10 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
             do = _tool_taken_off(cell_fit, change, these, otherwise) or do
     else:
         # Views here and there, as of every second row.
-        run, when = order[~is_used], "in all of these"
-        most = 1.0 / CLEAR_RATIO
-        if len(run) < FEWEST_VIEWS:
+        if alike is None:
             return
-        # Of views here and there, wrong poses alike by chance are no frame.
-        if (change := _common_change(inliers, run, most, _ARM_LEAVES)) is None:
-            return
-        run, change = _alike(inliers, np.sort(run), *change)
+        when = "in all of these"
+        run, change = _alike(inliers, np.sort(order[~is_used]), *alike)
         some = [rows[row].view for row in run.tolist()]
         words += ". The result is that of the other views; calibrate these alone, too."
         otherwise = "the result is that of the other views."
@@ -214,12 +212,14 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
 
 def of_moved(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     """Outliers of one robot and one camera that one change explains, or an arm on its way."""
+    found, alike = _end_run(cell_fit), None
+    if found.change is None and len(outliers) >= FEWEST_VIEWS:
+        # Of views here and there, wrong poses alike by chance are no frame.
+        alike = _common_change(cell_fit.inlier_fit, outliers, 1.0 / CLEAR_RATIO, _ARM_LEAVES)
     # One change of a frame explains a push along the motion, too.
-    alike = _end_run(cell_fit).change or _common_change(
-        cell_fit.inlier_fit, outliers, 1.0 / CLEAR_RATIO, _ARM_LEAVES
-    )
-    on_the_way = [*_in_motion(cell_fit, outliers)] if alike is None else []
-    yield from on_the_way or _moved_run(cell_fit)
+    is_free = found.change is None and alike is None
+    on_the_way = [*_in_motion(cell_fit, outliers)] if is_free else []
+    yield from on_the_way or _moved_run(cell_fit, found, alike)
 
 
 def pushed_base(cell_fit: CellFit) -> Iterator[PoseFault]:

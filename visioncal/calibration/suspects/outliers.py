@@ -12,9 +12,7 @@ from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.moved_views import PoseFault, fault_of, of_moved, pushed_base
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, listed, some_of, view_words
-from visioncal.core.transforms import (
-    pose_difference,
-)
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Remedy, mending
 from visioncal.results import Moved

@@ -129,13 +129,14 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
         stops = [(-1, at) if view.stop is None else (view.stop, -1) for at, view in enumerate(rows)]
         counted_by = "stop of this robot"
     order = [*dict.fromkeys(stops[at] for at in of_robot)]
+    place_of = {stop: place for place, stop in enumerate(order)}
     first = {stops[at]: at for at in reversed(of_robot)}
     changed = {stops[at] for at in of_robot if rows[at].number in moved}
     cells, dropped = list[dict[str, str]](), list[int]()
     for at, view in enumerate(rows):
         source = at
         if view.number in moved:
-            place = order.index(stops[at]) + by
+            place = place_of[stops[at]] + by
             stop = order[place] if 0 <= place < len(order) else None
             if stop not in changed:
                 dropped.append(view.number)

@@ -13,7 +13,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.choices import MOUNTS
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
-from visioncal.core.number_format import known_name, some_of
+from visioncal.core.number_format import known_name, robot_words, some_of
 from visioncal.core.types import Progress
 from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.bags import BAG
@@ -199,12 +199,13 @@ def _reread(
     untested = {*doubtful.session.robots} - reread_robots if doubtful.robot is not None else set()
     if untested:
         raise DataError(
-            f"Nothing was written: the poses of robot {some_of(sorted(untested))} are in another "
-            "form, and too few views test how they are read.",
-            culprits=sorted(untested),
+            f"Nothing was written: the poses of {some_of([*map(robot_words, sorted(untested))])} "
+            "are in another form, and too few views test how they are read.",
+            culprits=["views.csv"],
             next_step="Write its rotations as qx, qy, qz, qw, or add views that show a target.",
         )
-    notes = [f"Poses of robot {name} stay as they are: no reading stands out." for name in refused]
+    left = map(robot_words, refused)
+    notes = [f"Poses of {whose} stay as they are: no reading stands out." for whose in left]
     if not reread_robots:
         notes.append("The poses of each robot that enough views test fit as first read.")
     return replace(doubtful.session, warnings=(*doubtful.session.warnings, *notes))

@@ -28,7 +28,7 @@ from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.documents.toml import read_toml
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_text_inside
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import robot_words, some_of
 from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.interchange.formats.assemble import (
     assemble,
@@ -340,7 +340,7 @@ def reread_robot(
         DataError: The reading changes more than this robot's poses.
     """
     session, robot = doubtful.session, of_robot.robot
-    whose = f"robot {robot}" if robot else "the robot"
+    whose = robot_words(robot)
     _refuse_lost(candidate)
     _refuse_mirrored(candidate, mirrors_poses=mirrors_poses)
     if not candidate.is_of_robot:
