@@ -18,7 +18,7 @@ _MIRROR = np.array([1.0, -1.0, 1.0])
 _UNITS = tuple(unit for unit in UNITS_M if unit != "um")
 # Radians that were read as degrees leave all rotations within 2 pi degrees of identity, per angle.
 _RADIANS_AS_DEGREES_RAD = np.deg2rad(12.0)
-# Weights of the numbers of a rotation, in a sum that tells rotations apart.
+# Weights of the numbers of a rotation, so that sums of different rotations differ.
 _UNEVEN = np.sqrt(np.array([[2.0, 3.0, 5.0], [7.0, 11.0, 13.0], [17.0, 19.0, 23.0]]))
 _GON = 0.9  # Degrees of a gon, of which 400 are a turn.
 

@@ -148,7 +148,7 @@ def _proves(run: RunState, trial: Trial) -> bool:
 
 
 def _of_joint(run: RunState, kind: str) -> str:
-    """A joint that looks like a linear axis, as a sentence; empty where the joints are known."""
+    """A joint in place of a linear axis, as a sentence; empty where the joints are known."""
     if not issubclass(KINDS[kind], Stretches) or all(
         arm.is_modelled for arm in run.cell_fit.arms.values()
     ):
