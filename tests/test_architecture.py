@@ -26,7 +26,7 @@ HOMES = {
     "pinocchio": {"robot"},
     "matplotlib": {"vision.printing", "present.report"},
     "jinja2": {"present"},
-    "pydantic": {"core.arguments", "session"},
+    "pydantic": {"session"},
     "yaml": {"core.documents", "interchange.exports"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -1,42 +1,45 @@
-"""Runtime checks of the arguments of public functions by pydantic, which converts none of them."""
+"""Runtime checks of the arguments of public functions against their annotations."""
 
-import re
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial, wraps
+from functools import cache, wraps
 from inspect import signature
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, BeforeValidator, InstanceOf, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import did_you_mean, listed
 from visioncal.core.types import Target, scalar_of
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
 
 # Classes of NumPy's numbers, too.
-_NUMBERS: dict[Any, Any] = {float: Real, int: Integral}
-# Words for pydantic's kinds of errors, and for the classes that a value is no instance of.
+_CLASSES: dict[Any, Any] = {float: Real, int: Integral, bool: (bool, np.bool_)}
+# Words for a value of a class.
 _WORDS = {
-    "none_required": "None",
-    "callable_type": "a function",
-    "list_type": "a list",
-    "str": "text",
-    "Path": "a path",
-    "Real": "a number",
-    "Integral": "a whole number",
-    "bool": "True or False",
-    "bytes": "bytes",
-    "Mapping": "a dict",
+    float: "a number",
+    int: "a whole number",
+    bool: "True or False",
+    str: "text",
+    Path: "a path",
+    bytes: "bytes",
+    Mapping: "a dict",
 }
+
+
+class _Fault(NamedTuple):
+    """A value that does not fit its annotation."""
+
+    place: tuple[int, ...]  # Its indices in the argument.
+    value: object
+    needed: str  # Words for a valid value.
+    choices: tuple[Any, ...] = ()  # The values of a Literal.
 
 
 def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
@@ -84,93 +87,88 @@ def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a function or a clas
 
 def _check(owner: str, values: Mapping[str, object], hints: Mapping[str, Any]) -> None:
     for name, value in values.items():
-        try:
-            _adapter(hints.get(name, Any)).validate_python(value)
-        except ValidationError as error:
-            raise _refusal(owner, name, value, hints[name], error) from error
+        if faults := _faults(hints.get(name, Any), value):
+            raise _refusal(owner, name, hints[name], faults)
 
 
-@cache
-def _adapter(hint: Any) -> TypeAdapter[Any]:  # noqa: ANN401 - a type
-    return TypeAdapter(_checkable(hint))
-
-
-def _checkable(hint: Any) -> Any:  # noqa: ANN401 - a type
-    """The type by which pydantic checks, of all but collections, only whose instance it is."""
+def _faults(hint: Any, value: object, place: tuple[int, ...] = ()) -> list[_Fault]:  # noqa: ANN401
+    """The faults of a value: of a union those by all of its members."""
     origin, inner = get_origin(hint), get_args(hint)
-    dtype = scalar_of(hint)
+    if origin in (Union, types.UnionType) and hint is not npt.ArrayLike:
+        by_member = [_faults(member, value, place) for member in inner]
+        faults = [fault for faults in by_member for fault in faults if fault.needed != "None"]
+        return faults if all(by_member) else []
+    if isinstance(origin, type) and (origin is tuple or issubclass(list, origin)):
+        elements = _elements(Sequence if origin is tuple else origin, value)
+        if elements is None:
+            return [_Fault(place, value, "a list")]
+        kind = Any if origin is tuple else inner[0]
+        checked = (_faults(kind, item, (*place, at)) for at, item in enumerate(elements))
+        return [fault for faults in checked for fault in faults]
+    needed = _needed(hint, value)
+    return [_Fault(place, value, needed, inner if origin is Literal else ())] if needed else []
+
+
+def _needed(hint: Any, value: object) -> str:  # noqa: ANN401 - a type
+    """Words for a valid value of a type that has no parts; empty where the value is one."""
+    origin, dtype = get_origin(hint), scalar_of(hint)
     if hint is npt.ArrayLike or dtype is not None:
         is_image = isinstance(dtype, type) and issubclass(dtype, np.unsignedinteger)
-        return Annotated[Any, AfterValidator(partial(_array, dtype if is_image else None))]
-    if hint is bool:
-        return InstanceOf[bool] | InstanceOf[np.bool_]
-    if origin in (Union, types.UnionType):
-        return Union[tuple(map(_checkable, inner))]  # noqa: UP007 - of any number of types
-    if origin is tuple:
-        return Annotated[list[Any], BeforeValidator(partial(_elements, Sequence))]
-    if isinstance(origin, type) and issubclass(list, origin):
-        return Annotated[list[_checkable(inner[0])], BeforeValidator(partial(_elements, origin))]  # type: ignore[misc]
-    if hint in (Any, types.NoneType) or origin in (Literal, Callable):
-        return hint
-    kind: Any = _NUMBERS.get(hint, origin or hint)
-    return typing.cast(Any, InstanceOf)[kind] if isinstance(kind, type) else Any
+        return _array_needed(dtype if is_image else None, value)
+    if hint is types.NoneType:
+        return "None" if value is not None else ""
+    if origin is Literal:
+        choices = get_args(hint)
+        is_one = any(value == choice for choice in choices if isinstance(value, type(choice)))
+        return "" if is_one else listed([*map(repr, choices)], "or")
+    if origin is Callable:
+        return "" if callable(value) else "a function"
+    kind = origin or hint
+    if hint is Any or not isinstance(kind, type) or isinstance(value, _CLASSES.get(kind, kind)):
+        return ""
+    article = "an" if kind.__name__[0] in "AEIOU" else "a"
+    return _WORDS.get(kind, f"{article} {kind.__name__}")
 
 
-def _array(pixel: type | None, value: object) -> object:
-    """Refuses what is no image of a type of pixels, or no array of numbers for None."""
+def _array_needed(pixel: type | None, value: object) -> str:
+    """Words for an image of a type of pixels, or an array of numbers for None; or empty."""
     if pixel is not None:
         is_sound = isinstance(value, np.ndarray) and value.dtype == pixel and value.ndim > 1
-    else:
-        try:
-            is_sound = np.asarray(value).dtype.kind in "biuf"
-        except ValueError:
-            # Rows differ in length; the function itself reports which.
-            is_sound = not isinstance(value, str)
-    if not is_sound:
-        raise ValueError("an array" if pixel is None else f"an image of {pixel.__name__}")
-    return value
+        return "" if is_sound else f"an image of {pixel.__name__}"
+    try:
+        is_sound = np.asarray(value).dtype.kind in "biuf"
+    except ValueError:
+        # Rows differ in length; the function itself reports which.
+        is_sound = not isinstance(value, str)
+    return "" if is_sound else "an array"
 
 
-def _elements(kind: type, value: object) -> object:
-    """The elements of a collection that are checked: none of one that reading would use up."""
+def _elements(kind: type, value: object) -> Sequence[object] | None:
+    """The elements that are checked: none of what reading would use up; None for no collection."""
     if isinstance(value, np.ndarray) and issubclass(Sequence, kind):
-        return list(value[:1]) if value.ndim else value
+        return list(value[:1]) if value.ndim else None
     if not isinstance(value, kind) or isinstance(value, str | bytes | Mapping):
         return None
-    return list(value) if isinstance(value, list | tuple) else []
+    return value if isinstance(value, list | tuple) else ()
 
 
-def _refusal(
-    owner: str, name: str, given: object, hint: object, error: ValidationError
-) -> DataError:
+def _refusal(owner: str, name: str, hint: object, faults: Sequence[_Fault]) -> DataError:
     """Says what was given, what is needed, and how to get that."""
-    errors = error.errors(include_url=False)
-    places = [[part for part in entry["loc"] if isinstance(part, int)] for entry in errors]
     # Of a union's members, the one that got to an element says most.
-    place = max(places, key=len)
-    worst = [entry for entry, at in zip(errors, places, strict=True) if at == place]
-    value = worst[0]["input"] if place else given
-    needed = " or ".join(dict.fromkeys(map(_needed, worst)))
+    place = max((fault.place for fault in faults), key=len)
+    worst = [fault for fault in faults if fault.place == place]
+    value, needed = worst[0].value, " or ".join(dict.fromkeys(fault.needed for fault in worst))
     seen, step = "None" if value is None else f"of the type {type(value).__name__}", ""
     if isinstance(value, np.ndarray):
         seen = f"an array of {value.dtype}, of the shape {value.shape}"
     if isinstance(value, str | Path):
-        seen = f"{_WORDS['str' if isinstance(value, str) else 'Path']} ({str(value)!r})"
+        seen = f"{_WORDS[str if isinstance(value, str) else Path]} ({str(value)!r})"
         options = (hint, *get_args(hint))
         loaders = [f"{option.__name__}.load" for option in options if hasattr(option, "load")]
         loaders += ["load_target"] * (Target in options)
         step = f"Load it first: visioncal.{loaders[0]}({str(value)!r})." if loaders else ""
-        if any(entry["type"] == "literal_error" for entry in worst):
-            step = did_you_mean(str(value), re.findall("'(.*?)'", needed))
+        if choices := [choice for fault in worst for choice in fault.choices]:
+            step = did_you_mean(str(value), choices)
     at = "".join(f"[{index}]" for index in place)
     message = f"{owner}: {name}{at} is {seen}, but must be {needed}."
     return DataError(message, culprits=[name], next_step=step)
-
-
-def _needed(entry: ErrorDetails) -> str:
-    """Words for valid input in place of that of an error."""
-    context = entry.get("ctx", {})
-    kind = context.get("class", entry["type"])
-    article = "an" if kind[0] in "AEIOU" else "a"
-    words = context.get("error", context.get("expected", _WORDS.get(kind, f"{article} {kind}")))
-    return str(words)

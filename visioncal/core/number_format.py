@@ -102,10 +102,10 @@ def counted(count: int, thing: str, verbs: tuple[str, str] | None = None) -> str
     return words if verbs is None else f"{words} {verbs[0] if is_one else verbs[1]}"
 
 
-def listed(words: Sequence[str]) -> str:
+def listed(words: Sequence[str], joint: str = "and") -> str:
     """Joins words: `a, b and c`."""
     *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
+    return f"{', '.join(first)} {joint} {last}" if first else last
 
 
 def ranges(numbers: Iterable[int]) -> str:
