@@ -26,7 +26,6 @@ HOMES = {
     "pinocchio": {"robot"},
     "matplotlib": {"vision.printing", "present.report"},
     "jinja2": {"present"},
-    "pydantic": {"session"},
     "yaml": {"core.documents", "interchange.exports"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -316,7 +316,7 @@ def test_joints_without_room_are_left_out_and_named():
     assert {stroke.joint for stroke in found.strokes} == {0, 2}
     with pytest.raises(DegenerateError, match="no posture was found"):
         plan_sweeps(motion_limits(arm, MotionMargins(floor_m=2.0)), SweepRequest())
-    raised(DataError, "1 speeds", SweepRequest, speeds=1)
+    raised(DataError, "speeds is 1, but must be", SweepRequest, speeds=1)
 
 
 @pytest.fixture
@@ -424,7 +424,7 @@ def test_checks_that_are_impossible_are_named(tmp_path):
         (("--payload", "-2,0,0,0"), "a mass of 0 kg or more"),
         (("--tool", "100,0"), "a length and a radius above zero"),
         (("--speed-deg", -5), "--speed-deg"),
-        (("--speed", 2), "speed is 2.0, but must be 0.01 to 1"),
+        (("--speed", 2), "speed is 2.0, but must be a number from 0.01 to 1"),
         (("--floor", 1900), "no posture was found from which its joints could sweep"),
         (("--floor", 1900, "--no-sweeps"), "none of 2000 postures within the limits is clear"),
     ],

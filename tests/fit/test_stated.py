@@ -150,7 +150,7 @@ def test_poses_by_images_that_hardly_differ_are_one_reading_unless_taken_anew():
 def off_lens(rng, sigma_px, **changes):
     """A table of a lens whose matrix is stated wrong by a sigma."""
     matrix = (np.array(TABLE.matrix) + sigma_px * rng.normal(size=4)).tolist()
-    return TABLE.model_copy(update={"matrix": matrix, "matrix_sigma_px": sigma_px, **changes})
+    return replace(TABLE, matrix=matrix, matrix_sigma_px=sigma_px, **changes)
 
 
 @pytest.mark.parametrize("draws", seeds(2, 12))
@@ -176,7 +176,7 @@ def test_a_stated_lens_is_as_sure_as_its_sigma(mode, draws):
 def test_a_refined_lens_without_a_sigma_is_found_from_the_corners():
     small = made(5, 20)
     matrix = [value * 1.02 for value in TABLE.matrix[:2]] + list(TABLE.matrix[2:])
-    table = TABLE.model_copy(update={"matrix": matrix, "intrinsics": "refine"})
+    table = replace(TABLE, matrix=matrix, intrinsics="refine")
     fit = solve(replace(small.cell, cameras={"cam": table})).fit
     off = fit.camera("cam").matrix - np.array(TABLE.matrix)
     sigmas = np.sqrt(np.diag(fit.covariance(("lens", "cam"))))[:4]
@@ -258,7 +258,7 @@ def test_the_axis_of_a_given_lens_with_wrong_decentring_is_within_its_sigma(stop
         # Five views leave distortion no parameters of its own: a field shows that it is wrong.
         small, off = made(seed, stops), np.array(TABLE.distortion)
         off[2:4] += [1.6e-3, -1.2e-3]
-        table = TABLE.model_copy(update={"distortion": off.tolist()})
+        table = replace(TABLE, distortion=tuple(off.tolist()))
         fit = solve(replace(small.cell, cameras={"cam": table})).fit
         away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
         squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))

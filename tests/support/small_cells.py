@@ -15,9 +15,9 @@ from visioncal.vision.targets import corner_positions
 
 BOARD = Target("board", "checkerboard", 5, 4, 0.04, 4e-6)
 TABLE = CameraTable(
-    resolution=[1280, 1024],
-    matrix=[1150.0, 1152.0, 644.0, 508.0],
-    distortion=[-0.11, 0.09, 0.0004, -0.0006, -0.01],
+    resolution=(1280, 1024),
+    matrix=(1150.0, 1152.0, 644.0, 508.0),
+    distortion=(-0.11, 0.09, 0.0004, -0.0006, -0.01),
 )
 PX, ROBOT_RAD, ROBOT_M = 0.1, 2e-4, 1e-4
 
@@ -97,7 +97,7 @@ def made(seed=0, stops=8, cameras=1, *, in_hand=True, given=True, sways=0.0):
 
 def replace_lens(table):
     """A camera of which only the resolution is stated."""
-    return table.model_copy(update={"matrix": None, "distortion": None})
+    return replace(table, matrix=None, distortion=None)
 
 
 def without(cell, row):

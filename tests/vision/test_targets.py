@@ -93,7 +93,7 @@ def test_an_unknown_name_lists_the_names_and_a_near_one():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"kind": "chess"}, "kind is 'chess', but must be \"charuco\" or"),
+        ({"kind": "chess"}, "kind is 'chess', but must be \"charuco\", "),
         ({"columns": 2}, "columns is 2, but must be a whole number from 3 to 100"),
         ({"square_sigma_m": 1e-300}, "is 1e-300, but must be a standard deviation from 1e-08 m"),
         ({"square_sigma_m": 0.04}, r"is 0\.04, .* to the square's own 0\.03 m"),

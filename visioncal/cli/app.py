@@ -94,8 +94,6 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Whatever a command starts imports nothing from the folder in which it was typed.
     os.environ["PYTHONSAFEPATH"] = "1"
-    # To find plugins of pydantic, the metadata of all that is installed would be read.
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # A thousand modules create many permanent objects: garbage collection at Python's default rate
     # takes a twentieth of a small calibration's time, and finds nothing.
     gc.set_threshold(20_000, 100)

@@ -61,7 +61,7 @@ class DynamicsPlanOptions(ClearanceOptions):
         f"Identified, too: {', '.join(PLANNED_FRICTION)}; or none.",
         default="coulomb,viscous,offset",
     )
-    sweep_speeds: int = _motion("Speeds at which each joint sweeps.", default=6)
+    sweep_speeds: int = _motion("Speeds at which each joint sweeps.", default=6, min=2, max=30)
     no_sweeps: bool = _motion("Only the exciting motion.", "--no-sweeps", default=False)
     rate_hz: float = _motion(
         "Sampling rate of the tables.", "--rate", default=500.0, min=1.0, max=4000.0

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args
 import numpy as np
 import numpy.typing as npt
 
+from visioncal.core.codec import Check
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, listed
 from visioncal.core.types import Target, scalar_of
@@ -61,9 +62,12 @@ def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
     return checked
 
 
-def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
-    """Checks the types of a dataclass' fields against its annotations; raises DataError."""
-    _check(type(instance).__name__, vars(instance), _hints(instance.__class__))
+def check_fields(instance: Any, label: str = "") -> None:  # noqa: ANN401 - any dataclass
+    """Checks a dataclass' fields against its annotations and their `Check`s; raises DataError.
+
+    `label` names it in messages, in place of its class.
+    """
+    _check(label or type(instance).__name__, vars(instance), _hints(instance.__class__))
 
 
 _signature = cache(signature)
@@ -73,7 +77,7 @@ _signature = cache(signature)
 def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a function or a class
     """Annotations of a function's parameters, those of `Unpack` one by one, or of a class."""
     if isinstance(owner, type):
-        return typing.get_type_hints(owner)
+        return typing.get_type_hints(owner, include_extras=True)
     # Return types may be imported for type checkers only.
     declared = {name: hint for name, hint in owner.__annotations__.items() if name != "return"}
     hints = typing.get_type_hints(
@@ -98,6 +102,11 @@ def _faults(hint: Any, value: object, place: tuple[int, ...] = ()) -> list[_Faul
         by_member = [_faults(member, value, place) for member in inner]
         faults = [fault for faults in by_member for fault in faults if fault.needed != "None"]
         return faults if all(by_member) else []
+    if origin is typing.Annotated:
+        checks = [mark for mark in inner[1:] if isinstance(mark, Check)]
+        return _faults(inner[0], value, place) or [
+            _Fault(place, value, check.needed) for check in checks if not check.fits(value)
+        ]
     if isinstance(origin, type) and (origin is tuple or issubclass(list, origin)):
         elements = _elements(Sequence if origin is tuple else origin, value)
         if elements is None:
@@ -158,7 +167,8 @@ def _refusal(owner: str, name: str, hint: object, faults: Sequence[_Fault]) -> D
     place = max((fault.place for fault in faults), key=len)
     worst = [fault for fault in faults if fault.place == place]
     value, needed = worst[0].value, " or ".join(dict.fromkeys(fault.needed for fault in worst))
-    seen, step = "None" if value is None else f"of the type {type(value).__name__}", ""
+    is_short = value is None or isinstance(value, Real | np.bool_)
+    seen, step = repr(value) if is_short else f"of the type {type(value).__name__}", ""
     if isinstance(value, np.ndarray):
         seen = f"an array of {value.dtype}, of the shape {value.shape}"
     if isinstance(value, str | Path):

@@ -1,12 +1,13 @@
-"""Codec of frozen dataclasses as JSON, with type checks on reading.
+"""Codec of frozen dataclasses as JSON or TOML, with checks of types and ranges on reading.
 
 A field's key is its name, or that of its `Key`. None and empty defaults are not written. Unknown
 keys are ignored, or kept in a field marked `REST`. Errors name the path of the value, such as
-`kinematics.levels[2].rms_mm`.
+`kinematics.levels[2].rms_mm`, and one error names all wrong fields of a table.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -15,10 +16,13 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import did_you_mean, listed
 from visioncal.core.types import FloatArray, scalar_of
 
 _T = TypeVar("_T")
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+_SHOWN = 60  # Letters of a value in a message.
+_SEVERAL = {float: "numbers", int: "whole numbers", str: "texts"}
 
 
 @contextmanager
@@ -51,6 +55,39 @@ class Array:
     # Message on other faults of an array; empty for none.
     fault: Callable[[FloatArray], str] | None = None
 
+    @property
+    def needed(self) -> str:
+        """Words for an array of the shape."""
+        sizes = " x ".join("n" if size < 0 else str(size) for size in self.shape)
+        return f"an array of {sizes} numbers"
+
+
+@dataclass(frozen=True)
+class Check:
+    """Condition of a value, and the words for a valid one."""
+
+    needed: str
+    fits: Callable[[Any], bool] = lambda _: True
+    names: tuple[str, ...] = ()  # Valid texts, of which similar ones are named.
+
+
+def one_of(*names: str) -> Check:
+    """The check that a text is among known ones."""
+    return Check(needed_of(Literal[names]), names.__contains__, names)
+
+
+def within(least: float, most: float) -> Check:
+    """The check that a number is in a range, ends included; whole numbers have whole ends."""
+    noun = "a whole number" if isinstance(least, int) else "a number"
+    return Check(f"{noun} from {least:g} to {most:g}", lambda value: least <= value <= most)
+
+
+@dataclass(frozen=True)
+class Lenient:
+    """Conversion of other forms in which a value may be written, before it is read."""
+
+    convert: Callable[[Any], Any]  # Its errors are those of the value.
+
 
 @dataclass(frozen=True, eq=False)
 class WrittenForm:
@@ -68,6 +105,10 @@ INLINE, REST = object(), object()
 KEPT, DROPPED, UNWRITTEN = object(), object(), object()
 Vector = Annotated[FloatArray, Array((-1,))]
 Matrix = Annotated[FloatArray, Array((-1, -1))]
+Finite = Annotated[float, Check("a number", math.isfinite)]
+Count = Annotated[int, Check("a whole number from 1 on", lambda value: value >= 1)]
+NotNegative = Annotated[float, Check("0 or more", lambda value: 0.0 <= value < math.inf)]
+Positive = Annotated[float, Check("a number above 0", lambda value: 0.0 < value < math.inf)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,59 +213,101 @@ def read_fields(cls: type, document: object, path: str) -> dict[str, Any]:
     """Reads the fields of a dataclass by name; its errors are those of `read`."""
     table, known_fields = _table(document, path), entries(cls)
     known_keys = set().union(*(entry.keys for entry in known_fields))
-    values = {}
+    values, faults = dict[str, Any](), list[DataError]()
     for entry in known_fields:
-        if REST in entry.marks:
-            rest = {key: value for key, value in table.items() if key not in known_keys}
-            values[entry.name] = _read(entry.kind, rest, path)
-        elif INLINE in entry.marks:
-            if entry.required or entry.keys & table.keys():
-                values[entry.name] = _read(entry.kind, table, path)
-        elif entry.key in table:
-            values[entry.name] = _read(entry.kind, table[entry.key], _joined(path, entry.key))
-    for entry in known_fields:
-        if entry.required and entry.name not in values:
-            place = _joined(path, entry.key)
-            raise DataError(f"{place} is missing.", culprits=[place])
+        try:
+            if REST in entry.marks:
+                rest = {key: value for key, value in table.items() if key not in known_keys}
+                values[entry.name] = read_value(entry.kind, rest, path)
+            elif INLINE in entry.marks:
+                if entry.required or entry.keys & table.keys():
+                    values[entry.name] = read_value(entry.kind, table, path)
+            elif entry.required or entry.key in table:
+                place = _joined(path, entry.key)
+                values[entry.name] = read_value(entry.kind, table.get(entry.key, MISSING), place)
+        except DataError as error:
+            faults.append(error)
+    if faults:
+        raise _together(faults)
     return values
 
 
-def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON may hold
+def _together(faults: Sequence[DataError]) -> DataError:
+    """One error in place of several, or the only one."""
+    if len(faults) == 1:
+        return faults[0]
+    return DataError(
+        f"{'; '.join(fault.message.removesuffix('.') for fault in faults)}.",
+        culprits=[culprit for fault in faults for culprit in fault.culprits],
+        next_step=" ".join(dict.fromkeys(filter(None, (fault.next_step for fault in faults)))),
+    )
+
+
+def read_value(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON may hold
+    """Reads a value of a type; `MISSING` is refused; the errors are those of `read`."""
     origin, args = get_origin(kind), get_args(kind)
+    if value is MISSING:
+        raise DataError(f"{path} is missing, but must be {needed_of(kind)}.", culprits=[path])
     if kind is Any:
         return value
     if origin is Annotated:
-        return _read_marked(args, value, path)
+        return _read_marked(kind, value, path)
     if origin in (Union, UnionType):
-        return _read(_fitting(_alternatives(kind), value), value, path)
+        return read_value(_fitting(_alternatives(kind), value), value, path)
     if origin is Literal:
-        if value not in args:
-            words = ", ".join(map(repr, args))
-            raise type_error(value, f"one of {words}" if len(args) > 1 else words, path)
+        if not any(value == each for each in args if type(value) is type(each)):
+            raise type_error(value, needed_of(kind), path, _similar(value, args))
         return value
     if origin is tuple:
-        return _read_tuple(args, value, path)
+        return _read_tuple(kind, value, path)
     if origin is not None and issubclass(origin, Mapping):
-        table = _table(value, path)
-        return {name: _read(args[1], item, _joined(path, name)) for name, item in table.items()}
+        items = _table(value, path).items()
+        return {name: read_value(args[1], item, _joined(path, name)) for name, item in items}
     if is_dataclass(kind):
         return read(kind, value, path)  # type: ignore[arg-type] # no instance, but a class
     return plain(kind, value, path)
 
 
-def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: ANN401 - see `_read`
-    inner, *marks = args
+def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see `read_value`
+    inner, *marks = get_args(kind)
     for mark in marks:
         if isinstance(mark, Array):
-            return _array(inner, mark, value, path)
+            return _array(kind, mark, value, path)
         if isinstance(mark, WrittenForm):
             content = value if mark.form is None else read(mark.form, value, path)
-            try:
-                return mark.read(content, path)
-            except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-                why = str(error) or type(error).__name__
-                raise DataError(f"{path}: {why}.", culprits=[path]) from error
-    return _read(inner, value, path)
+            return _converted(mark.read, path, content, path)
+        if isinstance(mark, Lenient):
+            value = _converted(mark.convert, path, value)
+    checked = read_value(inner, value, path)
+    for mark in marks:
+        if isinstance(mark, Check) and not mark.fits(checked):
+            raise type_error(value, mark.needed, path, _similar(value, mark.names))
+    return checked
+
+
+def _converted(convert: Callable[..., Any], path: str, *given: object) -> Any:  # noqa: ANN401
+    try:
+        return convert(*given)
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        why = str(error) or type(error).__name__
+        raise DataError(f"{path}: {why}.", culprits=[path]) from error
+
+
+def needed_of(kind: Any) -> str:  # noqa: ANN401 - a type
+    """Words for a valid value of a type."""
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        stated = (mark.needed for mark in args[1:] if isinstance(mark, Check | Array))
+        return next(stated, None) or needed_of(args[0])
+    if origin in (Union, UnionType):
+        return " or ".join(dict.fromkeys(map(needed_of, _alternatives(kind))))
+    if origin is Literal:
+        return listed([f'"{each}"' if isinstance(each, str) else repr(each) for each in args], "or")
+    if origin is tuple:
+        item = (get_args(args[0]) or args)[0]
+        of = "" if args[-1] is Ellipsis else f" of {len(args)} {_SEVERAL.get(item, '')}"
+        return f"a list{of}".rstrip()
+    return _WORDS.get(kind, "a table")
 
 
 def _alternatives(kind: Any) -> list[Any]:  # noqa: ANN401 - a type
@@ -249,55 +332,64 @@ def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
     return max(kinds, key=fit)
 
 
-def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, ...]:
-    if not isinstance(value, list):
-        raise type_error(value, "a list", path)
-    if args[-1] is Ellipsis:
+def _read_tuple(kind: Any, value: object, path: str) -> tuple[Any, ...]:  # noqa: ANN401
+    args = get_args(kind)
+    if isinstance(value, list | tuple) and args[-1] is Ellipsis:
         args = (args[0],) * len(value)
-    if len(value) != len(args):
-        raise type_error(value, f"a list of {len(args)}", path)
+    if not isinstance(value, list | tuple) or len(value) != len(args):
+        raise type_error(value, needed_of(kind), path)
     return tuple(
-        _read(kind, item, f"{path}[{index}]")
+        read_value(kind, item, f"{path}[{index}]")
         for index, (kind, item) in enumerate(zip(args, value, strict=True))
     )
 
 
 def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: ANN401
-    """Reads an array of a type such as `npt.NDArray[np.float64]`."""
-    wanted = scalar_of(kind)
-    sizes = " x ".join("n" if index < 0 else str(index) for index in form.shape)
-    shape_error = type_error(value, f"an array of {sizes} numbers", path)
-    try:
+    """Reads an array of a type such as `Annotated[FloatArray, Array((3,))]`."""
+    wanted = scalar_of(get_args(kind)[0])
+    # Rows may differ in length.
+    with suppress(ValueError):
         array = np.asarray(value)
-    except ValueError as error:
-        raise shape_error from error
-    if not array.size:
-        array = np.zeros((*array.shape, *(0,) * len(form.shape))[: len(form.shape)])
-    elif array.dtype.kind not in ("b" if wanted is np.bool_ else "iuf"):
-        raise shape_error
-    pairs = zip(array.shape, form.shape, strict=False)
-    if array.ndim != len(form.shape) or not all(
-        actual == wanted_size or wanted_size < 0 for actual, wanted_size in pairs
-    ):
-        raise shape_error
-    fault = form.fault(array) if form.fault else ""
-    if fault:
-        raise DataError(f"{path} {fault}.", culprits=[path])
-    return array.astype(wanted)
+        if not array.size:
+            array = np.zeros((*array.shape, *(0,) * len(form.shape))[: len(form.shape)])
+        elif array.dtype.kind not in ("b" if wanted is np.bool_ else "iuf"):
+            raise type_error(value, needed_of(kind), path)
+        sizes = zip(array.shape, form.shape, strict=False)
+        if array.ndim == len(form.shape) and all(has == size or size < 0 for has, size in sizes):
+            if fault := form.fault(array) if form.fault else "":
+                raise DataError(f"{path} {fault}.", culprits=[path])
+            return array.astype(wanted)
+    raise type_error(value, needed_of(kind), path)
 
 
 def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what JSON may hold
     """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
-        raise type_error(value, _WORDS[kind], path)
+        raise type_error(value, needed_of(kind), path)
     return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
 
 
-def type_error(value: object, needed: str, path: str) -> DataError:
-    """Builds the error for a value of another type than needed."""
+def _similar(value: object, names: Collection[Any]) -> str:
+    return did_you_mean(value, names) if isinstance(value, str) else ""
+
+
+def type_error(value: object, needed: str, path: str, next_step: str = "") -> DataError:
+    """Builds the error for another value than needed."""
     place = path or "the document"
-    return DataError(f"{place} is {value!r:.60}, but must be {needed}.", culprits=[place])
+    return DataError(
+        f"{place} is {shown(value)}, but must be {needed}.", culprits=[place], next_step=next_step
+    )
+
+
+def shown(value: object) -> str:
+    """A value as text for a message, shortened."""
+    text = repr(value)
+    if len(text) <= _SHOWN:
+        return text
+    if isinstance(value, Mapping):
+        return f"a mapping of {', '.join(map(str, list(value)[:8]))}"[:_SHOWN]
+    return f"a list of {len(value)}" if isinstance(value, list) else f"{text[:_SHOWN]}..."
 
 
 def _table(value: object, path: str) -> Mapping[str, Any]:

@@ -3,9 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
+from visioncal.core.arguments import check_fields
+from visioncal.core.codec import within
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
@@ -22,24 +25,19 @@ CHECK_HZ = 1000.0
 class MotionMargins:
     """Margins of a planned motion."""
 
-    margin_rad: float = 0.05  # Distance of the joints from the ends of their ranges [rad].
-    speed: float = 0.9  # Usable share of the greatest speeds.
-    acceleration: float = 0.9  # Usable share of the greatest accelerations.
-    torque: float = 1.2  # Safety factor of the torques predicted by the nominal inertias.
-    clearance_m: float = 0.03  # Distance of the arm from itself, the floor and all bodies [m].
+    # Distance of the joints from the ends of their ranges [rad].
+    margin_rad: Annotated[float, within(0.0, np.pi)] = 0.05
+    speed: Annotated[float, within(0.01, 1.0)] = 0.9  # Usable share of the greatest speeds.
+    # Usable share of the greatest accelerations.
+    acceleration: Annotated[float, within(0.01, 1.0)] = 0.9
+    # Safety factor of the torques predicted by the nominal inertias.
+    torque: Annotated[float, within(1.0, 10.0)] = 1.2
+    # Distance of the arm from itself, the floor and all bodies [m].
+    clearance_m: Annotated[float, within(0.0, 10.0)] = 0.03
     floor_m: float | None = 0.0  # Height of the floor in the base frame [m]; None for none.
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("margin_rad", 0.0, np.pi),
-            ("speed", 0.01, 1.0),
-            ("acceleration", 0.01, 1.0),
-            ("torque", 1.0, 10.0),
-            ("clearance_m", 0.0, 10.0),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise DataError(f"limits: {name} is {value}, but must be {low:g} to {high:g}.")
+        check_fields(self, "limits")
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,13 @@ two directions: friction remains, speed by speed (Swevers, Verdonck and De Schut
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
-from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.arguments import check_fields
+from visioncal.core.codec import Positive, within
+from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.excitation import even_times
 from visioncal.dynamics.limits import MotionExtremes, MotionLimits, motion_extremes
@@ -30,23 +33,15 @@ _WIDEST_RAD, _STEP_RAD = 2.4, 0.1
 class SweepRequest:
     """Options of planned sweeps."""
 
-    speeds: int = 6  # Number of speeds of each joint, logarithmically spaced.
-    slowest_rad_s: float = 0.02  # The least of them [rad/s].
-    hold_s: float = 3.0  # Duration of constant speed, where the range allows it [s].
+    # Number of speeds of each joint, logarithmically spaced.
+    speeds: Annotated[int, within(2, 30)] = 6
+    slowest_rad_s: Positive = 0.02  # The least of them [rad/s].
+    # Duration of constant speed, where the range allows it [s].
+    hold_s: Annotated[float, within(_SHORTEST_HOLD_S, 60.0)] = 3.0
     seed: int = 0  # Seed of the random postures.
 
     def __post_init__(self) -> None:
-        if not (2 <= self.speeds <= 30 and self.slowest_rad_s > 0.0):
-            raise DataError(
-                f"sweeps have {self.speeds} speeds from {self.slowest_rad_s:g} rad/s, but must "
-                "have 2 to 30, above zero.",
-                culprits=["--sweep-speeds"],
-            )
-        if not _SHORTEST_HOLD_S <= self.hold_s <= 60.0:
-            raise DataError(
-                f"hold_s is {self.hold_s:g}, but must be {_SHORTEST_HOLD_S} to 60.",
-                culprits=["hold_s"],
-            )
+        check_fields(self, "sweeps")
 
 
 @dataclass(frozen=True)

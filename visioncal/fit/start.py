@@ -199,7 +199,7 @@ def _by_corners(cell: Cell, frame: str, table: CameraTable) -> Camera:
     rows = [*corners]
     corners = {rows[at]: corners[rows[at]] for at in evenly(len(rows), _IMAGES)}
     most = np.max([np.ones(2), *(at.px.max(axis=0) for at in corners.values())], axis=0)
-    size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
+    size = table.resolution or (int(most[0]) + 1, int(most[1]) + 1)
     try:
         return estimate_intrinsics(corners, [*boards.values()], size, table.model).camera
     except (ConvergenceError, DegenerateError):

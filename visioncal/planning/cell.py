@@ -5,7 +5,8 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from visioncal.core.codec import Array, Vector, WrittenForm
+from visioncal.core.arguments import check_fields
+from visioncal.core.codec import Array, Check, NotNegative, Vector, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, rigid_fault
 from visioncal.core.types import FloatArray, Mount, Target
@@ -25,14 +26,16 @@ from visioncal.vision.targets import (
     target_name,
 )
 
-# Greatest angle between the line of sight and a board's normal [rad].
-_STEEPEST_RAD = 1.4
 # Noise of well-kept arms and cameras, where none is stated [rad, m and px].
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(5e-5, 3e-5), 0.1
 # Thickness of the plate under a board, and its rim around the print [m].
 _PLATE_M, _RIM_M = 0.01, 0.02
 
 
+_TILT = Check(
+    "above 0 and up to 1.4: beyond it the camera looks at the board's edge",
+    lambda angle: 0.0 < angle <= 1.4,
+)
 Pose: TypeAlias = Annotated[FloatArray, Array((4, 4))]
 # Forms in plan.json. A board that comes with visioncal gets its name.
 _TARGET = WrittenForm(
@@ -73,30 +76,23 @@ class Limits:
     """Limits of every planned stop, and of every path between two of them."""
 
     # Distance of the joints from their limits [rad]; [m] for a prismatic joint.
-    joint_margin_rad: float = 0.05
+    joint_margin_rad: NotNegative = 0.05
     # Least and greatest distance of the camera from the board's centre [m]. None takes distances at
     # which the board fills the image well, and stays in it within the uncertainty of the guesses.
     distance_m: tuple[float, float] | None = None
     # Least and greatest depth at which the image is sharp [m]; None for any.
     focus_m: tuple[float, float] | None = None
-    tilt_rad: float = 0.9  # Greatest angle between the line of sight and the board's normal [rad].
-    edge_px: float = 20.0  # Distance of the board from the image's edge [px].
+    # Greatest angle between the line of sight and the board's normal [rad].
+    tilt_rad: Annotated[float, _TILT] = 0.9
+    edge_px: NotNegative = 20.0  # Distance of the board from the image's edge [px].
     # Distance of the arm, and of what it carries, from the floor, the board, the boxes and itself
     # [m].
-    clearance_m: float = 0.03
+    clearance_m: NotNegative = 0.03
     # Height of the floor in the base frame [m]; None for a cell without one.
     floor_m: float | None = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("joint_margin_rad", "edge_px", "clearance_m"):
-            value = getattr(self, name)
-            if not 0.0 <= value < np.inf:
-                raise DataError(f"limits: {name} is {value}, but must be zero or more.")
-        if not 0.0 < self.tilt_rad <= _STEEPEST_RAD:
-            raise DataError(
-                f"limits: tilt_rad is {self.tilt_rad}; above 0 and up to {_STEEPEST_RAD} is "
-                "needed: beyond it the camera looks at the board's edge."
-            )
+        check_fields(self, "limits")
         for name in ("distance_m", "focus_m"):
             span = getattr(self, name)
             if span is not None and not 0.0 <= span[0] < span[1]:
@@ -117,8 +113,8 @@ class PlanCell:
     x: Pose
     # (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
     z: Pose
-    sigma_rad: float  # Standard deviation of both rotations, per axis [rad].
-    sigma_m: float  # The same for their translations [m].
+    sigma_rad: NotNegative  # Standard deviation of both rotations, per axis [rad].
+    sigma_m: NotNegative  # The same for their translations [m].
     noise: Annotated[Noise, _NOISE]  # Noise of the robot's poses.
     pixel_px: float  # Noise of a corner, per axis [px].
     limits: Limits = field(default_factory=Limits)
@@ -141,11 +137,7 @@ class PlanCell:
             )
         for name, edge in (("x", self.x), ("z", self.z)):
             _check_pose(f"the guess of {name}", edge)
-        for name in ("sigma_rad", "sigma_m"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise DataError(
-                    f"the guesses: {name} is {getattr(self, name)}, but must be zero or more."
-                )
+        check_fields(self, "the guesses")
 
     def collisions(self) -> Collisions:
         """See `collision_model`."""

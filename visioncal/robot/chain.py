@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
+from visioncal.core.codec import Array, Check
 from visioncal.core.documents.toml import DocumentTable
-from visioncal.core.errors import DataError
 from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.transforms import LAST_ROW, exp, rigid_fault, skew
 from visioncal.core.types import FloatArray, Mask
@@ -15,6 +15,17 @@ from visioncal.core.types import FloatArray, Mask
 # Columns of a joint's function: offset, ratio, sine, cosine.
 FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")
 IDENTITY_FUNCTION = (0.0, 1.0, 0.0, 0.0)
+_Placement: TypeAlias = Annotated[
+    FloatArray,
+    Check("a list of 4 rows of 4 numbers, a rigid transform [m]"),
+    Array(
+        (4, 4),
+        lambda matrix: (
+            (fault := rigid_fault(matrix, NORM_TOLERANCE))
+            and f"must be a rigid transform [m], but {fault}"
+        ),
+    ),
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,19 +206,9 @@ def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
     if not any(given):
         return None
     size = len(given[0]) if isinstance(given[0], Sequence) else 0
-    needed = f"{size} pairs of numbers, sine and cosine of the orders from 2 on [rad]"
-    for row, pairs in zip(rows, given, strict=True):
-        if not isinstance(pairs, Sequence) or len(pairs) != size or not size:
-            raise row.refuse("harmonics", pairs, needed)
-    return np.array(
-        [
-            [
-                DocumentTable({"harmonics": pair}, row.label).numbers("harmonics", 2)
-                for pair in pairs
-            ]
-            for row, pairs in zip(rows, given, strict=True)
-        ]
-    )
+    words = Check(f"{size} pairs of numbers, sine and cosine of the orders from 2 on [rad]")
+    kind = Annotated[FloatArray, words, Array((size, 2))]
+    return np.array([row.read("harmonics", kind) for row in rows])
 
 
 def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:
@@ -256,16 +257,6 @@ def _axis(row: DocumentTable) -> FloatArray:
 
 
 def _placement(row: DocumentTable) -> FloatArray:
-    rows = row.content.get("placement")
-    needed = "a list of 4 rows of 4 numbers, a rigid transform [m]"
-    if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
-        raise row.refuse("placement", rows, needed)
-    tables = [DocumentTable({"placement": value}, row.label) for value in rows]
-    matrix = np.array([table.numbers("placement", 4) for table in tables])
-    if fault := rigid_fault(matrix, NORM_TOLERANCE):
-        raise DataError(
-            f"{row.label}: placement must be a rigid transform [m], but {fault}.",
-            culprits=[f"{row.label}: placement"],
-        )
+    matrix: FloatArray = row.read("placement", _Placement)
     matrix[3] = LAST_ROW
     return matrix

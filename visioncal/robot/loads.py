@@ -6,11 +6,12 @@ gear yields to it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.codec import Check
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
@@ -19,6 +20,9 @@ from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 MOST_KG, MOST_CENTRE_M = 2500.0, 3.0
 # Keys of a link's mass in a joint's table.
 MASS_KEYS = ("mass_kg", "com_m")
+_Mass: TypeAlias = Annotated[
+    float, Check("a mass of 0 kg or more", lambda mass: 0.0 <= mass < np.inf)
+]
 # Keys of the limits in a joint's table.
 RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
 
@@ -143,10 +147,7 @@ def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) ->
         return None
     kg, centres = [], []
     for row, frame in zip(rows, joint_from_row, strict=True):
-        mass = row.number("mass_kg")
-        if mass < 0.0:
-            raise row.refuse("mass_kg", mass, "a mass of 0 kg or more")
-        kg.append(mass)
+        kg.append(row.read("mass_kg", _Mass))
         centres.append(frame[:3, :3] @ np.array(row.numbers("com_m", 3)) + frame[:3, 3])
     return Masses(np.array(kg), np.array(centres))
 

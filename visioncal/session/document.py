@@ -2,22 +2,14 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal, Self, TypeAlias, cast
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    ValidationError,
-    model_validator,
-)
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.choices import POSE_FORMS
+from visioncal.core.codec import Check, Key, Lenient, Section, entries, one_of, read, within
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import did_you_mean
@@ -26,16 +18,16 @@ from visioncal.core.types import Camera, CameraKind, CameraMount, FloatArray, Ne
 
 # Limit that keeps squares and products from overflowing.
 _LARGEST = 1e15
-Number = Annotated[FiniteFloat, Field(ge=-_LARGEST, le=_LARGEST)]
-Positive = Annotated[FiniteFloat, Field(gt=0, le=_LARGEST)]
+Number = Annotated[float, Check("a finite number", lambda value: abs(value) <= _LARGEST)]
 # Plausible standard deviations of a focal length [px].
-PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
+PixelSigma = Annotated[float, within(1e-3, 1e4)]
 # Standard deviations of measured lengths [m] and angles [rad]: the least is a tenth of what the
 # best measuring machines reach. Beside smaller ones nothing is left of the images' information.
-MeasuredSigma = Annotated[FiniteFloat, Field(ge=1e-7, le=_LARGEST)]
-NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
+MeasuredSigma = Annotated[float, within(1e-7, _LARGEST)]
+NotNegative = Annotated[float, within(0.0, _LARGEST)]
+Positive = Annotated[float, Check("a number above 0", lambda value: 0.0 < value <= _LARGEST)]
 # Largest side of an image: four times that of the largest sensors [px].
-Side = Annotated[int, Field(gt=0, le=65_535)]
+Side = Annotated[int, within(1, 65_535)]
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 
@@ -44,15 +36,14 @@ def check_coefficients(model: str, count: int) -> None:
     """Checks the number of a lens's coefficients of distortion; raises ValueError."""
     if count not in (counts := _COEFFICIENTS[model]):
         raise ValueError(
-            f'has {count} coefficients of distortion, but the "{model}" model needs '
+            f'it has {count} coefficients of distortion, but the "{model}" model needs '
             f"{' or '.join(map(str, counts))} (0 for those that are not used)"
         )
 
 
-class TableModel(BaseModel):
-    """A table of session.toml. Unknown keys, of newer versions or users, are in `model_extra`."""
-
-    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class TableModel(Section):
+    """A table of session.toml. Unknown keys, of newer versions or users, are in `further`."""
 
 
 def _flat(value: object) -> object:
@@ -71,18 +62,19 @@ def _four(value: object) -> object:
             hint = f", as {[fx, fy, cx or x, cy or y]}"
         case _:
             hint = ""
-    raise ValueError(f"is {value}, but must be [fx, fy, cx, cy] [px]{hint}")
+    raise ValueError(f"it is {value}, but must be [fx, fy, cx, cy] [px]{hint}")
 
 
+@dataclass(frozen=True, kw_only=True)
 class CameraTable(TableModel):
     """`[camera]`. matrix: fx, fy, cx, cy [px]; resolution: width, height [px]."""
 
     name: str = "camera"
-    resolution: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
+    resolution: tuple[Side, Side] | None = None
     # "points": it measures points (meas_x_m ...), as of a ball, and has no lens.
-    seeing: CameraKind | Literal["points"] = Field(default="brown", alias="model")
-    matrix: Annotated[list[Number], BeforeValidator(_four)] | None = None
-    distortion: Annotated[list[Number], BeforeValidator(_flat)] | None = None
+    seeing: Annotated[Literal["brown", "fisheye", "points"], Key("model")] = "brown"
+    matrix: Annotated[tuple[Number, ...], Lenient(_four)] | None = None
+    distortion: Annotated[tuple[Number, ...], Lenient(_flat)] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
     matrix_sigma_px: PixelSigma | None = None
     focus: Literal["auto", "fixed"] = "auto"
@@ -90,7 +82,7 @@ class CameraTable(TableModel):
     depth_unit_m: Positive | None = None
     depth_of: Literal["z", "ray"] = "z"
     # Of measured poses (`cft_`): standard deviation of their scale, the size of the target.
-    scale_sigma: Annotated[Positive, Field(le=0.2)] | None = None
+    scale_sigma: Annotated[Positive, within(0.0, 0.2)] | None = None
 
     @property
     def model(self) -> CameraKind:
@@ -98,45 +90,31 @@ class CameraTable(TableModel):
         return "brown" if self.seeing == "points" else self.seeing
 
     @property
-    def size(self) -> tuple[int, int] | None:
-        """(width, height) of the camera's images [px], if declared."""
-        return None if self.resolution is None else (self.resolution[0], self.resolution[1])
-
-    @property
     def stated(self) -> Camera | None:
         """The stated intrinsics; None where they are to be estimated."""
-        if self.matrix is None or self.distortion is None or self.size is None:
+        if self.matrix is None or self.distortion is None or self.resolution is None:
             return None
-        matrix, distortion = np.array(self.matrix, float), np.array(self.distortion, float)
-        return Camera(self.model, self.size, matrix, distortion)
+        matrix, distortion = np.array(self.matrix), np.array(self.distortion)
+        return Camera(self.model, self.resolution, matrix, distortion)
 
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
+    def __post_init__(self) -> None:
         if self.distortion is not None:
             check_coefficients(self.model, len(self.distortion))
         if (self.matrix is None) != (self.distortion is None):
-            raise ValueError("has one of matrix and distortion: give both or neither")
+            raise ValueError("it has one of matrix and distortion: give both or neither")
         if self.matrix is not None and self.resolution is None:
-            raise ValueError("has no resolution, and its matrix holds for one alone")
+            raise ValueError("it has no resolution, and its matrix holds for one alone")
         if self.matrix is not None and min(self.matrix[:2]) <= 0:
-            raise ValueError(f"has the matrix {self.matrix}, but fx and fy must be above 0")
+            raise ValueError(f"it has the matrix {[*self.matrix]}, but fx and fy must be above 0")
         # No lens of a camera sees more than 170 degrees without distortion.
         if self.matrix and min(self.matrix[:2]) < 0.04 * max(self.resolution or ()):
             raise ValueError(
-                f"has the matrix {self.matrix}, but fx and fy are in pixels: the focal length over "
-                "the side of a pixel, both in mm"
+                f"it has the matrix {[*self.matrix]}, but fx and fy are in pixels: the focal "
+                "length over the side of a pixel, both in mm"
             )
-        return self
 
 
-def _form(name: str | None) -> str | None:
-    if name is not None and name not in POSE_FORMS:
-        hint = did_you_mean(name, POSE_FORMS)
-        known = f"is {name!r}, but must be one of {', '.join(POSE_FORMS)}"
-        raise ValueError(f"{known} ({hint})" if hint else known)
-    return name
-
-
+@dataclass(frozen=True, kw_only=True)
 class RobotTable(TableModel):
     """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
 
@@ -146,10 +124,11 @@ class RobotTable(TableModel):
 
     model: str | None = None
     tip: str | None = None
-    form: Annotated[str | None, AfterValidator(_form)] = None
-    gravity_m_s2: Annotated[list[Number], Field(min_length=3, max_length=3)] | None = None
+    form: Annotated[str, one_of(*POSE_FORMS)] | None = None
+    gravity_m_s2: tuple[Number, Number, Number] | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
 class InstrumentTable(TableModel):
     """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]; see `instruments`."""
 
@@ -159,30 +138,30 @@ class InstrumentTable(TableModel):
     sigma_rad: MeasuredSigma | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
 class ClockTable(TableModel):
-    """`[clock]`. Offset of the camera's stamps from the robot's [s]."""
+    """`[clock]`. Offset of the camera's stamps from the robot's [s]; None for not stated."""
 
-    camera_minus_robot_s: Number = 0.0
+    camera_minus_robot_s: Number | None = None
 
 
-def _place(at: object) -> object:
+def _is_place(at: object) -> bool:
     numbers = at if isinstance(at, list) else []
-    is_place = len(numbers) == 3 and all(type(number) in (int, float) for number in numbers)
-    if at != "views" and not (is_place and all(abs(number) <= FAR_M for number in numbers)):
-        raise ValueError(
-            f'is {at!r}, but must be "views" or [x, y, z] in the base, in metres (under {FAR_M:g})'
-        )
-    return at
+    are_numbers = len(numbers) == 3 and all(type(number) in (int, float) for number in numbers)
+    return at == "views" or (are_numbers and all(abs(number) <= FAR_M for number in numbers))
 
 
+@dataclass(frozen=True, kw_only=True)
 class NeedTable(TableModel):
     """`[need]`. Required accuracy of picks [mm], [deg], and where; see `types.Need`."""
 
     mm: Positive | None = None
     deg: Positive | None = None
     corrected: bool = False
-    # "views" or three numbers.
-    at: Annotated[Any, AfterValidator(_place)] = "views"
+    at: Annotated[
+        Any,
+        Check(f'"views" or [x, y, z] in the base, in metres (under {FAR_M:g})', _is_place),
+    ] = "views"
 
     @property
     def need(self) -> Need:
@@ -192,13 +171,12 @@ class NeedTable(TableModel):
         x, y, z = map(float, self.at)
         return Need(self.mm, self.deg, (x, y, z), self.corrected)
 
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
+    def __post_init__(self) -> None:
         if self.mm is None and self.deg is None and not self.corrected:
-            raise ValueError("says neither mm nor deg: give how near picks have to come")
-        return self
+            raise ValueError("it says neither mm nor deg: give how near picks have to come")
 
 
+@dataclass(frozen=True, kw_only=True)
 class PriorTable(TableModel):
     """`[prior.A_from_B]`. Measured components of B's position in A, with sigma_m [m].
 
@@ -209,7 +187,7 @@ class PriorTable(TableModel):
     y_m: Number | None = None
     z_m: Number | None = None
     sigma_m: MeasuredSigma | None = None
-    quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
+    quaternion_xyzw: tuple[Number, Number, Number, Number] | None = None
     sigma_rad: MeasuredSigma | None = None
 
     @property
@@ -220,24 +198,26 @@ class PriorTable(TableModel):
         turn = Rotation.from_quat(self.quaternion_xyzw or [])
         return compose(turn.as_matrix(), np.array([self.x_m, self.y_m, self.z_m], float))
 
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
+    def __post_init__(self) -> None:
         turn, is_placed = self.quaternion_xyzw, {self.x_m, self.y_m, self.z_m} != {None}
         if not is_placed and turn is None:
-            raise ValueError("names no component: x_m, y_m or z_m, or quaternion_xyzw")
+            raise ValueError("it names no component: x_m, y_m or z_m, or quaternion_xyzw")
         if is_placed and self.sigma_m is None:
-            raise ValueError("has no sigma_m, the standard deviation of x_m, y_m and z_m")
+            raise ValueError("it has no sigma_m, the standard deviation of x_m, y_m and z_m")
         if (turn is None) != (self.sigma_rad is None):
-            raise ValueError("needs quaternion_xyzw and sigma_rad together, or neither")
+            raise ValueError("it needs quaternion_xyzw and sigma_rad together, or neither")
         if turn is not None and not 0.9 < sum(value * value for value in turn) < 1.1:
-            raise ValueError(f"has quaternion_xyzw {turn}, but its length must be 1")
-        return self
+            raise ValueError(f"it has quaternion_xyzw {[*turn]}, but its length must be 1")
 
 
+_TARGET = "a name in targets/, or the path of a .toml"
+
+
+@dataclass(frozen=True, kw_only=True)
 class TargetTable(TableModel):
     """`[targets.NAME]`, one of several. target: a name in targets/, or the path of a .toml."""
 
-    target: str
+    target: Annotated[str, Check(_TARGET)]
 
 
 Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
@@ -251,45 +231,41 @@ _EDGES = (
 )
 
 
-def _short(field: str) -> BeforeValidator:
-    """Validator that accepts `floor = "..."` for the table `[targets.floor]` with one field."""
-    return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
+def _short(field: str) -> Lenient:
+    """Accepts `floor = "..."` for the table `[targets.floor]` with one field."""
+    return Lenient(lambda value: {field: value} if isinstance(value, str) else value)
 
 
+@dataclass(frozen=True, kw_only=True)
 class Declaration(TableModel):
-    """Typed content of session.toml. Unknown keys are kept in `model_extra`.
+    """Typed content of session.toml. Unknown keys are kept in `further`.
 
     Of each kind there is one, in the singular table, or several by name, in the plural ones.
     frames: declared parents of frames; see `frames`. corrected: changes that `convert --guess`
     made, in sentences.
     """
 
-    schema_version: Literal[1] = Field(alias="schema")
+    schema_version: Annotated[Literal[1], Key("schema")]
     name: str
     mount: CameraMount | None = None
     target: str | None = None
-    targets: dict[str, Annotated[TargetTable, _short("target")]] = Field(default_factory=dict)
+    targets: Mapping[str, Annotated[TargetTable, _short("target")]] = field(default_factory=dict)
     camera: CameraTable | None = None
-    cameras: dict[str, CameraTable] = Field(default_factory=dict)
+    cameras: Mapping[str, CameraTable] = field(default_factory=dict)
     # The camera of depth pictures: `[cameras.depth]` beside `[camera]`.
     depth: CameraTable | None = None
     robot: RobotTable | None = None
-    robots: dict[str, Annotated[RobotTable, _short("model")]] = Field(default_factory=dict)
+    robots: Mapping[str, Annotated[RobotTable, _short("model")]] = field(default_factory=dict)
     instrument: InstrumentTable | None = None
-    instruments: dict[str, Annotated[InstrumentTable, _short("name")]] = Field(default_factory=dict)
-    frames: dict[str, Any] = Field(default_factory=dict)
+    instruments: Mapping[str, Annotated[InstrumentTable, _short("name")]] = field(
+        default_factory=dict
+    )
+    frames: Mapping[str, Any] = field(default_factory=dict)
     clock: ClockTable = ClockTable()
-    clocks: dict[str, ClockTable] = Field(default_factory=dict)
-    prior: dict[str, PriorTable] = Field(default_factory=dict)
+    clocks: Mapping[str, ClockTable] = field(default_factory=dict)
+    prior: Mapping[str, PriorTable] = field(default_factory=dict)
     need: NeedTable | None = None
-    corrected: list[str] = Field(default_factory=list)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _depth_apart(cls, content: dict[str, Any]) -> dict[str, Any]:
-        if "camera" not in content or content.get("cameras", {}).keys() != {"depth"}:
-            return content
-        return {**content, "cameras": {}, "depth": content["cameras"]["depth"]}
+    corrected: tuple[str, ...] = ()
 
     def named(self, kind: Kind) -> dict[str, TableModel]:
         """Tables of a kind by name, which is empty for the singular table."""
@@ -328,42 +304,28 @@ def read_declaration(document: Mapping[str, Any], *, observed: bool) -> Declarat
 
     `observed` says whether there are views, which need something that observed them.
     """
-    hints: list[str] = []
+    content = dict(document)
+    cameras = content.get("cameras")
+    if "camera" in content and isinstance(cameras, Mapping) and cameras.keys() == {"depth"}:
+        content |= {"cameras": {}, "depth": cameras["depth"]}
     try:
-        declaration = Declaration.model_validate(dict(document))
-    except ValidationError as error:
-        problems = [_problem(entry) for entry in error.errors()]
-    else:
-        problems = list(_contradictions(declaration, observed))
-        hints = [key for key in _unknown_keys(declaration, "") if "Did you mean" in key]
-    if problems:
+        declaration = read(Declaration, content, "")
+        _check_consistent(declaration, observed)
+    except DataError as error:
         raise DataError(
-            f"session.toml: {'; '.join(f'{field} {words}' for field, words in problems)}.",
-            culprits=[f"session.toml: {field}" for field, _ in problems],
-            next_step=" ".join(hints),
-        )
+            f"session.toml: {error.message}",
+            culprits=[f"session.toml: {culprit}" for culprit in error.culprits],
+            next_step=error.next_step,
+        ) from error
     return declaration
 
 
-_MISSING = {
-    "schema": " (schema = 1)",
-    "name": ' (name = "...")',
-    "mount": ' (mount = "eye-in-hand" or "eye-to-hand")',
-    "target": " (target = a name in targets/, or the path of a .toml)",
-}
-
-
-def _problem(entry: Mapping[str, Any]) -> tuple[str, str]:
-    """Path of a field, `camera.matrix[2]`, and message, from an entry of pydantic's list."""
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in entry["loc"])
-    path = "".join(parts).removeprefix(".")
-    if entry["type"] == "missing":
-        return path, f"is missing{_MISSING.get(str(entry['loc'][-1]), '')}"
-    if entry["type"] == "value_error":
-        return path, str(entry["ctx"]["error"])
-    is_table = entry["type"] in ("model_type", "dict_type")
-    needed = "must be a table" if is_table else entry["msg"].replace("Input should", "must")
-    return path, f"is {entry['input']!r}, but {needed}"
+def _check_consistent(declaration: Declaration, observed: bool) -> None:
+    """Checks that well-typed tables do not contradict each other."""
+    if problems := dict(_contradictions(declaration, observed)):
+        hints = [key for key in _unknown_keys(declaration) if "Did you mean" in key]
+        words = "; ".join(f"{field} {words}" for field, words in problems.items())
+        raise DataError(f"{words}.", culprits=[*problems], next_step=" ".join(hints))
 
 
 def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[str, str]]:
@@ -371,7 +333,7 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
     reads = declaration.instrument is not None or bool(declaration.instruments) or not observed
     implied = declaration.is_network or (reads and not declaration.named("camera"))
     if declaration.mount is None and not implied:
-        yield "mount", "is missing" + _MISSING["mount"]
+        yield "mount", 'is missing (mount = "eye-in-hand" or "eye-to-hand")'
     for kind in KINDS:
         several: Mapping[str, TableModel] = getattr(declaration, f"{kind}s")
         if several and getattr(declaration, kind) is not None:
@@ -416,7 +378,7 @@ def _far_priors(declaration: Declaration) -> Iterator[tuple[str, str]]:
 
 def declaration_warnings(declaration: Declaration) -> Iterator[str]:
     """Warnings: unknown keys, unknown priors, a principal point outside the image."""
-    yield from _unknown_keys(declaration, "")
+    yield from _unknown_keys(declaration)
     edges = [*_EDGES, *(f"{edge}_{name}" for edge in _EDGES for name in declaration.targets)]
     edges += ["cam_from_depth"] * (declaration.depth is not None)
     for edge in declaration.prior:
@@ -425,16 +387,15 @@ def declaration_warnings(declaration: Declaration) -> Iterator[str]:
             yield f"session.toml: prior.{edge} names no unknown edge and is ignored. {hint}".strip()
 
 
-def _unknown_keys(table: BaseModel, path: str) -> Iterator[str]:
-    fields = type(table).model_fields
-    known = [field.alias or name for name, field in fields.items()]
-    for key in table.model_extra or {}:
-        hint = did_you_mean(key, known)
-        yield f"session.toml: {path}{key} is not a known field and is ignored. {hint}".strip()
-    for name in fields:
-        value = getattr(table, name)
-        if isinstance(value, BaseModel):
-            yield from _unknown_keys(value, f"{path}{name}.")
-        elif name in ("prior", "clocks", *(f"{kind}s" for kind in KINDS)):
-            for key, entry in cast(Mapping[str, BaseModel], value).items():
-                yield from _unknown_keys(entry, f"{path}{name}.{key}.")
+def _unknown_keys(value: object, path: str = "") -> Iterator[str]:
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            yield from _unknown_keys(entry, f"{path}{key}.")
+    if isinstance(value, TableModel):
+        kind: type = type(value)
+        known = [entry.key for entry in entries(kind)]
+        for key in value.further:
+            hint = did_you_mean(key, known)
+            yield f"session.toml: {path}{key} is not a known field and is ignored. {hint}".strip()
+        for name, part in vars(value).items():
+            yield from _unknown_keys(part, f"{path}{name}.")

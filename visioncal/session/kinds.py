@@ -254,7 +254,7 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
     )
     for kind, example in examples:
         if view is not None and not declaration.named(kind):
-            near = get_close_matches(kind, declaration.model_extra or (), 1)
+            near = get_close_matches(kind, declaration.further, 1)
             raise DataError(
                 f"session.toml: {kind} is missing, but view {view.number} has "
                 f"{'an image' if view.image else 'rows in corners.csv'}.",

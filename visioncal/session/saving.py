@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
+from visioncal.core.codec import write
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, sha256, write_atomically
 from visioncal.core.temporary import temporary
@@ -100,7 +101,7 @@ def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str | b
             texts |= {str(Path(path).with_name(table)): rows for table, rows in tables.items()}
             texts[path] = text
             if name:
-                kept = {**table.model_dump(exclude_none=True), field: path}
+                kept = {**write(type(table), table), field: path}
                 placed[f"{kind}s"] = {**placed[f"{kind}s"], name: kept}
             else:
                 placed[kind] = path if kind == "target" else {**placed[kind], field: path}

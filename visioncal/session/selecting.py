@@ -292,7 +292,7 @@ def _is_of_robots(column: str) -> bool:
 
 def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
     """Content of session.toml for the chosen parts."""
-    document, declaration = dict(session.document), session.declaration
+    document = dict(session.document)
     for name in ("frames", "clocks", "prior", "mount", *KINDS, *(f"{kind}s" for kind in KINDS)):
         document.pop(name, None)
     document["mount"] = "eye-in-hand" if chosen.mount == "instrument" else chosen.mount
@@ -310,9 +310,9 @@ def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
             table = {"model": table}
         if table is not None:
             document[kind] = table
-    clock = declaration.clocks.get(chosen.camera.partition("_")[2])
-    if clock is not None:
-        document["clock"] = clock.model_dump(exclude_unset=True)
+    clocks, camera = session.document.get("clocks", {}), chosen.camera.partition("_")[2]
+    if camera in clocks:
+        document["clock"] = clocks[camera]
     frames = (chosen.base, chosen.flange, chosen.camera, chosen.target)
     short = dict(zip(frames, ("base", "flange", "cam", "target"), strict=True))
     priors = {}

@@ -499,7 +499,7 @@ class Session:
     def resolution(self) -> tuple[int, int] | None:
         """(width, height) of the images [px], if declared."""
         table = self.declaration.only_camera
-        return None if table is None else table.size
+        return None if table is None else table.resolution
 
     @property
     def robot_name(self) -> str | None:

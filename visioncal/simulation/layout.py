@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from visioncal.core.arguments import check_fields
-from visioncal.core.codec import WrittenForm, type_error
+from visioncal.core.codec import Count, WrittenForm, type_error
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.session import frame_name
@@ -229,7 +229,7 @@ class NetworkOptions(DrawOptions):
     )
     instruments: tuple[InstrumentAt, ...] = ()  # The instruments.
     points: tuple[PointAt, ...] = ()  # Points that these read.
-    stops: int = 30  # Number of stops, common to all robots.
+    stops: Count = 30  # Number of stops, common to all robots.
     pace_s: float = 0.0  # Time between stops [s]; 0 for rows without a time.
     share_seen: float = 1.0  # Share of the possible observations that is recorded, at random.
     # Number of images of each camera for its intrinsics only, with a hand-held board.
@@ -241,8 +241,7 @@ class NetworkOptions(DrawOptions):
     stray_images: int = 0  # Number of rows whose image is from another stop.
 
     def __post_init__(self) -> None:
-        if self.stops < 1:
-            raise DataError(f"simulation: stops is {self.stops}, but must be at least 1.")
+        check_fields(self, "simulation")
         if any(robot.warms_up for robot in self.robots) and self.pace_s <= 0.0:
             raise DataError("simulation: a robot that warms up needs pace_s, from stop to stop.")
         for robot in self.robots:
@@ -315,7 +314,7 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
     """
 
     mount: Mount = "eye-in-hand"  # Where the camera is.
-    views: int = 20  # Number of views.
+    views: Count = 20  # Number of views.
     target: Target = BOARDS["charuco"]  # Board as its file describes it.
     # Range of the camera's distance from the board's centre [m]; None for a range in which the
     # board fills the image well, limited to 0.7 to 1.2 m for a fixed camera.
@@ -340,9 +339,7 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
     camera_moved_m: float = 0.0  # Displacement of the camera from its usual pose in this cell [m].
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        if self.views < 1:
-            raise DataError(f"simulation: views is {self.views}, but must be at least 1.")
+        check_fields(self, "simulation")
         if not 0 <= self.wrong_views <= self.views:
             raise DataError(
                 f"simulation: wrong_views is {self.wrong_views}, 0 to {self.views} are possible."

@@ -198,7 +198,7 @@ def _mirrored_back(session: Session, state: RunState | None) -> Session:
             next_step="Mirror the target's poses in the program that measured them.",
         )
     if corners is not None:
-        (size,) = (camera.size for camera in session.cameras.values())
+        (size,) = (camera.resolution for camera in session.cameras.values())
         if size is None:
             raise DataError(
                 f"session {session.name!r} states no resolution, within which corners mirror.",
@@ -221,7 +221,7 @@ def _mirrored_back(session: Session, state: RunState | None) -> Session:
 def _usual_size(session: Session, images: Mapping[str, Image]) -> tuple[int, int]:
     """The stated (width, height) of the only camera, where an image has it, or the usual one."""
     sizes = Counter((image.shape[1], image.shape[0]) for image in images.values())
-    stated = [table.size for table in session.cameras.values()]
+    stated = [table.resolution for table in session.cameras.values()]
     if len(stated) == 1 and stated[0] is not None and stated[0] in sizes:
         return stated[0]
     return max(sizes, key=lambda size: (sizes[size], size), default=(0, 0))

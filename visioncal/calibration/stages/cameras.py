@@ -72,7 +72,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             if (view.image or view.has_corners)
             and name_of(session.declaration, "camera", view) == name
         ]
-        corners, resolution, frame = given or {}, table.size, frame_name("camera", name)
+        corners, resolution, frame = given or {}, table.resolution, frame_name("camera", name)
         if not views:
             continue
         if given is None:

@@ -155,7 +155,7 @@ def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
             "eye-in-hand" if on_flange else "eye-to-hand",
             tuple(rows),
             seen.poses,
-            table.camera_minus_robot_s if table.model_fields_set else None,
+            table.camera_minus_robot_s,
             None if lens is None else lens.camera,
             numbered_positions(tuple(session.boards.values())),
         )

@@ -171,7 +171,7 @@ def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Sea
     """The stated (width, height) of one camera's images [px], else the most common one."""
     names = {name_of(session.declaration, "camera", view) for view in views}
     tables = [session.cameras[name] for name in names & session.cameras.keys()]
-    of_cameras = {table.size for table in tables} - {None}
+    of_cameras = {table.resolution for table in tables} - {None}
     stated = of_cameras.pop() if len(of_cameras) == 1 else None
     sizes = {view: searched.size for view, searched in found.items() if searched.size is not None}
     if stated is not None and not sizes:

@@ -276,12 +276,10 @@ def session_start(observed: Observed, reference: str = "", *, has_priors: bool =
     cameras = dict(cell.cameras)
     for name, table in cameras.items():
         # The fit of poses holds a lens; what it may be off by counts.
-        other = table.model_copy(
-            update={"intrinsics": "auto"} if table.intrinsics == "hold" else {}
-        )
+        other = replace(table, intrinsics="auto") if table.intrinsics == "hold" else table
         if name in observed.lenses and observed.lenses[name].estimated:
             # The stated one may be another camera's.
-            other = other.model_copy(update={"matrix": None, "distortion": None})
+            other = replace(other, matrix=None, distortion=None)
         cameras[name] = other
     return start_of(replace(cell, cameras=cameras), lenses, EARLY_SHARE)
 

@@ -12,8 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from visioncal.core.codec import shown, type_error
 from visioncal.core.documents.toml import MAX_VALUES, check_values, too_deep, too_many
-from visioncal.core.documents.values import read_plain_text, shown
+from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_BYTES, decode_text, read_bytes
 
@@ -192,5 +193,5 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
     # Squares and products of larger numbers may overflow.
     document = parse_json(text, label, 1e60)
     if not isinstance(document, dict):
-        raise DataError(f"{label} is {shown(document)}, but must be a table.", culprits=[label])
+        raise type_error(document, "a table", label)
     return document

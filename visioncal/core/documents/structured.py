@@ -14,10 +14,11 @@ import yaml
 from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
+from visioncal.core.codec import shown
 from visioncal.core.documents.jsons import read_json
 from visioncal.core.documents.tables import is_number
 from visioncal.core.documents.toml import MAX_DEPTH, MAX_VALUES, check_values, too_deep, too_many
-from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_text, shown
+from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
 
@@ -84,11 +85,12 @@ class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when import
         """Reads a mapping, or one of OpenCV's matrices."""
         content: dict[str, object] = {}
         for key, value in node.value:
-            if not isinstance(key, yaml.ScalarNode) or key.value in content:
+            is_scalar = isinstance(key, yaml.ScalarNode)
+            if not is_scalar or key.value in content:
                 place = _place(self.where, key)
+                seen = shown(key.value) if is_scalar else f"a list of {len(key.value)}"
                 raise DataError(
-                    f"{place}: {shown(key.value)} must be a key that occurs once.",
-                    culprits=[place],
+                    f"{place}: {seen} must be a key that occurs once.", culprits=[place]
                 )
             content[key.value] = self.construct_object(value, deep=True)
         if node.tag.endswith("matrix"):

@@ -1,14 +1,15 @@
 """TOML, and small tables of it on boards and robots; bounds of all documents."""
 
-import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any
+from types import GenericAlias
+from typing import Annotated, Any, Literal
 
+from visioncal.core.codec import Finite, Positive, read_value, type_error, within
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, absence, one_line, read_text
 from visioncal.core.number_format import did_you_mean
@@ -169,67 +170,35 @@ class DocumentTable:
     content: Mapping[str, Any]  # The parsed table.
     label: str  # Its location, for messages.
 
-    def _value(self, key: str, default: object, needed: str) -> object:
+    def read(self, key: str, kind: Any, default: object = None) -> Any:  # noqa: ANN401 - of `kind`
+        """Reads a field as the codec reads a value of the type; None has no default."""
         value = self.content.get(key, default)
-        if value is None:
-            raise DataError(
-                f"{self.label}: {key} is missing, but must be {needed}.",
-                culprits=[f"{self.label}: {key}"],
-            )
-        return value
+        return read_value(kind, MISSING if value is None else value, f"{self.label}: {key}")
 
     def refuse(self, key: str, value: object, needed: str, next_step: str = "") -> DataError:
         """Builds the error for a field with an invalid value."""
-        return DataError(
-            f"{self.label}: {key} is {value!r}, but must be {needed}.",
-            culprits=[f"{self.label}: {key}"],
-            next_step=next_step,
-        )
+        return type_error(value, needed, f"{self.label}: {key}", next_step)
 
     def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
         """Reads a finite number, greater than zero if `positive`."""
-        needed = "a number above 0" if positive else "a number"
-        value = self._value(key, default, needed)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.refuse(key, value, needed)
-        if not math.isfinite(value) or (positive and value <= 0):
-            raise self.refuse(key, value, needed)
-        return float(value)
+        return float(self.read(key, Positive if positive else Finite, default))
 
     def numbers(self, key: str, count: int) -> list[float]:
         """Reads a list of `count` finite numbers."""
-        needed = f"a list of {count} numbers"
-        values = self._value(key, None, needed)
-        if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
-            raise self.refuse(key, values, needed)
-        return [DocumentTable({key: value}, self.label).number(key) for value in values]
+        return [*self.read(key, GenericAlias(tuple, (Finite,) * count))]
 
     def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
         """Reads a whole number from `low` to `high`."""
-        needed = f"a whole number from {low} to {high}"
-        value = self._value(key, default, needed)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.refuse(key, value, needed)
-        return value
+        return int(self.read(key, Annotated[int, within(low, high)], default))
 
     def text(self, key: str, default: str | None = None) -> str:
         """Reads a string."""
-        value = self._value(key, default, "a text")
-        if not isinstance(value, str):
-            raise self.refuse(key, value, "a text")
-        return value
+        return str(self.read(key, str, default))
 
     def flag(self, key: str, default: bool) -> bool:
         """Reads true or false."""
-        value = self._value(key, default, "true or false")
-        if not isinstance(value, bool):
-            raise self.refuse(key, value, "true or false")
-        return value
+        return bool(self.read(key, bool, default))
 
     def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
         """Reads one of several strings."""
-        needed = " or ".join(f'"{choice}"' for choice in choices)
-        value = self._value(key, default, needed)
-        if value not in choices:
-            raise self.refuse(key, value, needed, did_you_mean(str(value), choices))
-        return str(value)
+        return str(self.read(key, Literal[choices], default))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.codec import type_error
 from visioncal.core.errors import DataError
 from visioncal.core.files import UTF16_MARKS, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
@@ -20,7 +21,6 @@ DECIMAL_COMMA = r"[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?"
 
 # Two of the usual characters of GBK on end: in Windows-1252 four letters with accents.
 _HAN = re.compile(rb"(?:[\xb0-\xd7][\xa1-\xfe]){2}")
-_SHOWN = 60  # characters of a value in a message
 
 
 def read_plain_text(path: Path) -> str:
@@ -47,16 +47,6 @@ def read_plain_text(path: Path) -> str:
         return data.decode("cp1252", "replace")
 
 
-def shown(value: object) -> str:
-    """A value as text for a message, shortened."""
-    if isinstance(value, Mapping):
-        return f"a mapping of {', '.join(map(str, list(value)[:8]))}"[:_SHOWN]
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
-
-
 def as_numbers(value: object, where: str) -> FloatArray:
     """Reads a number or regular nested lists of numbers, null as NaN; raises DataError."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
@@ -66,25 +56,21 @@ def as_numbers(value: object, where: str) -> FloatArray:
             return np.array(value, dtype=float)
         except (ValueError, TypeError, OverflowError):
             pass
-    raise DataError(f"{where} is {shown(value)}, but must be numbers.", culprits=[where])
+    raise type_error(value, "numbers", where)
 
 
 def number(value: object, where: str) -> float:
     """Reads one finite number; raises DataError."""
     numbers = as_numbers(value, where)
     if numbers.size != 1 or not np.isfinite(numbers).all():
-        raise DataError(
-            f"{where} is {shown(value)}, but must be one finite number.", culprits=[where]
-        )
+        raise type_error(value, "one finite number", where)
     return float(numbers.reshape(-1)[0])
 
 
 def mapping(value: object, where: str) -> Mapping[str, Any]:
     """Checks that a value is a mapping; raises DataError."""
     if not isinstance(value, Mapping):
-        raise DataError(
-            f"{where} is {shown(value)}, but must be keys with values.", culprits=[where]
-        )
+        raise type_error(value, "keys with values", where)
     return value
 
 

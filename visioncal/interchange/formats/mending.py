@@ -251,7 +251,7 @@ def _turn_pictures(session: Session, chosen: Sequence[int], degrees: float) -> S
     if corners is not None:
         px = corners.px.copy()
         for view in (view for view in rows if view.has_corners):
-            size = session.cameras[name_of(session.declaration, "camera", view)].size
+            size = session.cameras[name_of(session.declaration, "camera", view)].resolution
             if size is None:
                 raise DataError(
                     f"session {session.name!r} states no resolution, within which corners turn.",
