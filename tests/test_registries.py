@@ -110,7 +110,7 @@ def kind_faults(kinds):
     """Kinds of boards that `target make` or the page of boards leave out."""
     for name, kind in kinds.items():
         if kind.options and not in_help(name, "target", "make"):
-            yield f"{name}: not among --kind of BoardOptions in cli/session_options.py"
+            yield f"{name}: not among --kind of vision/board_request.py"
         if f'"{name}"' not in text_of_tests("vision"):
             yield f"{name}: no board of this kind in tests/vision, as in test_printing.py"
         if f'"{name}"' not in page("visioncal/vision/README.md"):

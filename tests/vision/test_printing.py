@@ -13,8 +13,8 @@ from support.refusals import raised
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards import DetectedCorners, find_target
-from visioncal.vision.boards.kind import BoardRequest
 from visioncal.vision.printing.drawing import to_png, to_svg
 from visioncal.vision.printing.page import EDGE_MM, arrange, pages_named, requested_target
 from visioncal.vision.printing.pattern import draw_pattern

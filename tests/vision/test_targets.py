@@ -34,9 +34,10 @@ from visioncal.simulation import (
     write_session,
 )
 from visioncal.simulation.textures import draw_sheet
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target
 from visioncal.vision.boards.charuco import Charuco, charuco_board
-from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA, BoardRequest
+from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
 from visioncal.vision.printing.page import pages_named, requested_target
 from visioncal.vision.printing.pattern import draw_pattern
 from visioncal.vision.targets import (

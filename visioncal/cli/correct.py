@@ -9,12 +9,12 @@ import numpy as np
 import typer
 
 from visioncal.cli.console import check_usable, print_json, say, warn
-from visioncal.cli.parsing import numbers_in
 from visioncal.cli.result_options import CorrectOptions
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_bytes, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, mm_and_deg
+from visioncal.core.parsing import numbers_in
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats import PoseImportOptions

@@ -28,7 +28,6 @@ from visioncal.cli.dynamics_options import (
     DynamicsValidateOptions,
     StreamOptions,
 )
-from visioncal.cli.parsing import numbers_in
 from visioncal.cli.plan import boxes_of, floor_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict
@@ -36,6 +35,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure, matched, significant, some_of
+from visioncal.core.parsing import numbers_in
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.differences import check_as_identified, difference_of

@@ -5,18 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from visioncal.cli.options import (
-    REQUIRED,
-    argument,
-    flag,
-    json_flag,
-    numbers_option,
-    option,
-    out_folder,
-    robot_name,
-)
+from visioncal.cli.options import json_flag, out_folder, robot_name
 from visioncal.cli.session_options import ClearanceOptions, kept_option
 from visioncal.core.choices import DYNAMICS_FILE, GAIN_SIGMA
+from visioncal.core.options import REQUIRED, argument, flag, numbers_option, option
 
 # Terms of friction that torques determine, and those that a motion can be planned for.
 FRICTION = ("coulomb", "viscous", "offset")

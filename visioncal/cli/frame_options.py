@@ -8,24 +8,21 @@ from visioncal.cli.options import (
     ActOptions,
     PartOptions,
     against_option,
-    argument,
     camera_name,
     example_flag,
-    flag,
     force_bad,
     force_flag,
     form_option,
     json_flag,
-    numbers_option,
-    option,
     robot_name,
     session_argument,
 )
-from visioncal.cli.parsing import FORMS, POSE
 from visioncal.cli.session_options import RobotPoseOptions
 from visioncal.core.choices import (
     UNITS_M,
 )
+from visioncal.core.options import argument, flag, numbers_option, option
+from visioncal.core.parsing import FORMS, POSE
 
 
 @dataclass(frozen=True, kw_only=True)

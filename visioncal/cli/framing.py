@@ -11,12 +11,12 @@ from visioncal.cli.console import answer, exit_status, print_json, report_writte
 from visioncal.cli.convert import import_options
 from visioncal.cli.frame_options import FixtureOptions, FrameOptions, TcpOptions
 from visioncal.cli.history import enter
-from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, listed, mm_and_deg
+from visioncal.core.parsing import refuse_given
 from visioncal.core.transforms import pose_difference
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.frame_from_images import seen_frame

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 from visioncal.cli.console import asked
-from visioncal.cli.parsing import refuse_given
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.errors import DataError, DriverError
+from visioncal.core.parsing import refuse_given
 from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.live.capture.cell import HostClock, LiveCell
 from visioncal.live.capture.devices import open_arm, open_camera

@@ -10,13 +10,13 @@ import typer
 
 from visioncal.cli.console import check_usable, print_json, say, warn
 from visioncal.cli.frame_options import LocateOptions
-from visioncal.cli.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.conventions import PoseForm, controller_form, stated_pose
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, some_of
+from visioncal.core.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
 from visioncal.frames.locate import (

@@ -1,42 +1,20 @@
 """Options of commands, declared as fields of the records that they take; shared ones once."""
 
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from visioncal.cli.parsing import address_in, numbers_in, size_in
 from visioncal.core.choices import SITE_FILE, ImagesKept
+from visioncal.core.options import REQUIRED, argument, flag, option
+from visioncal.core.parsing import address_in
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.session.selecting import Choice
-
-# Of an option or an argument that has to be given.
-REQUIRED: Any = MISSING
-
-
-def option(words: str, *names: str, default: object = None, **attributes: object) -> Any:  # noqa: ANN401
-    """A field of a record that the command line sets by an option.
-
-    Args:
-        words: What it is, with its unit.
-        *names: Its names; by default that of the field.
-        default: Its value where it is not given; `REQUIRED` for none.
-        **attributes: `min`, `max`, `metavar`, `panel` (its heading in the help), or others of
-            typer's; `parse`, which makes the value of the typed words and the option's name; and
-            `needs`, a field without whose value the option is refused.
-    """
-    return field(default=default, metadata={"option": (words, names, attributes)})
-
-
-def flag(words: str, *names: str, **attributes: object) -> Any:  # noqa: ANN401 - as `option`
-    """A field that an option without a value switches on; see `option`."""
-    return field(default=False, metadata={"flag": (words, names, attributes)})
 
 
 def example_flag(name: str) -> Any:  # noqa: ANN401 - as `option`
@@ -51,11 +29,6 @@ def example_flag(name: str) -> Any:  # noqa: ANN401 - as `option`
 
     words = "Print a small table, or a line, that works."
     return flag(words, "--example", callback=show, is_eager=True)
-
-
-def argument(words: str, default: object = REQUIRED, **attributes: object) -> Any:  # noqa: ANN401
-    """A field that the command line sets by its place; see `option`."""
-    return field(default=default, metadata={"argument": (words, (), attributes)})
 
 
 session_argument = partial(argument, "A session's folder, or its .rrd recording.")
@@ -74,21 +47,11 @@ robot_name = partial(option, "Of a whole cell: which robot, as a.", "--robot")
 against_option = partial(
     option, "The calibration: an output folder of calibrate, or its .rrd.", default=REQUIRED
 )
-# Of an option for the size of images.
-SIZE: Mapping[str, Any] = {"parse": size_in, "metavar": "W,H"}
 
 
 def out_folder(words: str = "The folder to write into.", *names: str, **attributes: object) -> Any:  # noqa: ANN401
     """The option of a folder to write into; see `option`."""
     return option(words, *(names or ("-o", "--out")), file_okay=False, **attributes)
-
-
-def numbers_option(
-    words: str, *names: str, form: str, scale: float = 1.0, **attributes: object
-) -> Any:  # noqa: ANN401 - as `option`
-    """An option of numbers with commas between, as `form` names them; see `option`."""
-    parse = partial(numbers_in, form=form, scale=scale)
-    return option(words, *names, metavar=form.upper(), parse=parse, **attributes)
 
 
 @dataclass(frozen=True, kw_only=True)

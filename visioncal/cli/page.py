@@ -14,7 +14,6 @@ import numpy as np
 
 from visioncal.cli.console import say
 from visioncal.cli.live_cell import check_order, opened, recorded_cell, taking_of
-from visioncal.cli.parsing import refuse_given
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.choices import CameraMount
@@ -26,6 +25,7 @@ from visioncal.core.extras import client_library
 from visioncal.core.files import read_text, write_json
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import counted
+from visioncal.core.parsing import refuse_given
 from visioncal.interchange.outputs import CALIBRATION, VERIFY
 from visioncal.interchange.result_files import load_calibration
 from visioncal.live.capture.cell import LiveCell

@@ -10,7 +10,6 @@ import numpy as np
 import tomli_w
 
 from visioncal.cli.console import answer, print_json, report_written, say, warn
-from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.plan_source import Kept, Source, chosen_part, find_source, pose_of, robot_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import MOST_FOR_NEED, ClearanceOptions, PlanOptions
@@ -18,6 +17,7 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import listed, percent, some_of
+from visioncal.core.parsing import numbers_in, refuse_given
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, Need, Progress
 from visioncal.estimation.problem_parts import Noise

@@ -7,7 +7,6 @@ import numpy as np
 
 from visioncal.calibration.run import calibrate
 from visioncal.cli.console import answer, print_json, report_written, say, warn
-from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.plan_source import Kept, Source, pose_of, robot_of
 from visioncal.cli.session_options import PlanOptions
 from visioncal.core.choices import Criterion
@@ -15,6 +14,7 @@ from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import json_text
 from visioncal.core.number_format import some_of
+from visioncal.core.parsing import numbers_in, refuse_given
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.frames.touches import robot_noise

@@ -7,10 +7,10 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.cli.parsing import numbers_in
 from visioncal.cli.session_options import PlanOptions
 from visioncal.core.conventions import PoseForm, controller_form
 from visioncal.core.errors import DataError
+from visioncal.core.parsing import numbers_in
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.outputs import CALIBRATION

@@ -7,10 +7,10 @@ from typing import Any
 
 from visioncal.cli.console import asked, print_json, say
 from visioncal.cli.live_cell import check_order, opened, recorded_cell, taking_of
-from visioncal.cli.parsing import refuse_given
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure, listed
+from visioncal.core.parsing import refuse_given
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.devices import REQUESTING

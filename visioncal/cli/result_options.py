@@ -8,27 +8,21 @@ from typing import ClassVar, get_args
 import typer
 
 from visioncal.cli.options import (
-    REQUIRED,
     ActOptions,
     NeedOptions,
     PageOptions,
     PartOptions,
     WorkOptions,
     against_option,
-    argument,
     example_flag,
-    flag,
     force_bad,
     force_both,
     force_flag,
     form_option,
     json_flag,
-    numbers_option,
-    option,
     out_file,
     out_folder,
 )
-from visioncal.cli.parsing import POSE, serial_in, views_in
 from visioncal.core.choices import (
     SITE_FILE,
     WIDEST_RAD,
@@ -38,6 +32,8 @@ from visioncal.core.choices import (
     Standard,
 )
 from visioncal.core.limits import RecoveryLimits
+from visioncal.core.options import REQUIRED, argument, flag, numbers_option, option
+from visioncal.core.parsing import POSE, serial_in, views_in
 from visioncal.interchange.outputs import REPORT, VERIFY
 
 

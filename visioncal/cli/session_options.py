@@ -6,29 +6,14 @@ from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
 from visioncal.cli.options import (
-    REQUIRED,
-    SIZE,
     PageOptions,
-    argument,
     example_flag,
-    flag,
     force_flag,
     json_flag,
-    numbers_option,
-    option,
     out_folder,
     seed_option,
     session_argument,
     yes_flag,
-)
-from visioncal.cli.parsing import (
-    names_in,
-    pairs_in,
-    places_in,
-    scale_in,
-    shift_in,
-    tool_in,
-    turn_in,
 )
 from visioncal.core.choices import (
     PLAN_SPEED,
@@ -41,9 +26,20 @@ from visioncal.core.choices import (
     Mount,
     Standard,
 )
+from visioncal.core.options import REQUIRED, SIZE, argument, flag, numbers_option, option
+from visioncal.core.parsing import (
+    names_in,
+    pairs_in,
+    places_in,
+    scale_in,
+    shift_in,
+    tool_in,
+    turn_in,
+)
 from visioncal.live.capture.devices import CAMERAS
 from visioncal.live.capture.options import Stillness
 from visioncal.planning.purposes import PURPOSES
+from visioncal.vision.board_request import BoardRequest
 
 # Options by their headings in the help.
 _what = partial(option, panel="What is planned")
@@ -155,32 +151,7 @@ class SimulateOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardOptions:
-    """Options that describe a board."""
-
-    kind: str | None = option(
-        "Kind of the board.", metavar="charuco|checkerboard|aprilgrid|gridboard|circles|dots|marker"
-    )
-    columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
-    rows: int | None = option("The same along y.")
-    square_mm: float | None = option(
-        "Side of a square, or distance of circles' rows; else the largest."
-    )
-    marker_mm: float | None = option("Side of the markers of a ChArUco board.")
-    dictionary: str = option("As DICT_5X5_100, DICT_APRILTAG_36h11.", default="")
-    legacy: bool = flag("The ChArUco layout from before OpenCV 4.6.")
-    marker_id: int | None = option("Id of a single marker; the first of a board.", "--id")
-    size_mm: float | None = option("Side of a single marker or a tag; left out: the largest.")
-    spacing: float | None = option("White between the markers of a grid, in their sides: 0.3.")
-    border: int | None = option("Dark modules around their bits: 2, as Kalibr has it.")
-    diameter_mm: float | None = option("Diameter of circles.")
-    asymmetric: bool = flag("Every second row of circles is shifted by half.")
-    width_mm: float | None = option("Printed width of a picture.")
-    name: str = option("Name of a board described by options.", default="")
-
-
-@dataclass(frozen=True, kw_only=True)
-class TargetMakeOptions(BoardOptions):
+class TargetMakeOptions(BoardRequest):
     """Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its NAME.toml.
 
     Rulers along both axes show whether the printer kept the size. Exit status 0: all files are

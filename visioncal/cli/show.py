@@ -8,12 +8,12 @@ from pathlib import Path
 import typer
 
 from visioncal.cli.console import say
-from visioncal.cli.parsing import refuse_given
 from visioncal.cli.result_options import ShowOptions
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_text
 from visioncal.core.number_format import some_of
+from visioncal.core.parsing import refuse_given
 from visioncal.interchange.outputs import PERFORMANCE, PREVIEW, RECORDING
 from visioncal.interchange.result_files import load_result, load_stored
 from visioncal.results.views import worst_view

@@ -1,6 +1,5 @@
 """`visioncal target make` and `visioncal target check`."""
 
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -9,15 +8,16 @@ import tomli_w
 import typer
 
 from visioncal.cli.console import answer, print_json, say
-from visioncal.cli.session_options import BoardOptions, TargetCheckOptions, TargetMakeOptions
+from visioncal.cli.session_options import TargetCheckOptions, TargetMakeOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, one_line, write_atomically
 from visioncal.core.number_format import known_name
 from visioncal.core.types import Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards import KINDS, kind_of
 from visioncal.vision.boards.identify import Identity, describe, identify
 from visioncal.vision.boards.imaging import read_image
-from visioncal.vision.boards.kind import BoardRequest, metres, side_metres
+from visioncal.vision.boards.kind import metres, side_metres
 from visioncal.vision.boards.picture import kept_picture, unfit
 from visioncal.vision.printing.files import write_board
 from visioncal.vision.printing.page import arrange, pages_named, requested_target
@@ -37,30 +37,24 @@ _PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 def target_make_command(options: TargetMakeOptions) -> None:
     """Runs `visioncal target make`."""
     kind = options.kind
-    if (options.target is None) == (kind is None):
+    if (options.target is None) == (not kind):
         raise DataError(
             "Name a board, or describe one by --kind.",
             next_step=f"The boards are {', '.join(target_names())}.",
         )
-    board = {field.name: getattr(options, field.name) for field in fields(BoardOptions)}
     made = [name for name, at in KINDS.items() if at.options and name != "picture"]
-    if kind is not None:
+    if kind:
         known_name("kind of board", kind, made, "--kind")
     picture = Path(options.target or "")
     is_picture = picture.suffix.lower() in _PICTURES
-    _refuse_unused("picture" if is_picture else kind, board)
-    request, width_mm = None, board.pop("width_mm")
-    if kind is not None:
-        size_mm = board.pop("size_mm")
-        board["square_mm"] = board["square_mm"] if size_mm is None else size_mm
-        request = BoardRequest(**board)
-    sized = request is None or request.square_mm is not None
+    _refuse_unused("picture" if is_picture else kind, options)
+    sized = not kind or options.side_mm is not None
     names = [options.page] if options.page is not None else _PAGES if sized else _PAGES[:1]
     pages = tuple(page for name in names for page in pages_named(name, options.landscape))
     if is_picture:
-        chosen = _pictured(picture, width_mm, options.name or picture.stem)
+        chosen = _pictured(picture, options.width_mm, options.name or picture.stem)
     else:
-        chosen = requested_target(request, pages) if request else load_target(str(options.target))
+        chosen = requested_target(options, pages) if kind else load_target(str(options.target))
     sheet = arrange(chosen, pages)
     files = write_board(
         options.out, sheet, dpi=options.dpi, force=options.force, is_drawn=not options.toml_only
@@ -95,11 +89,11 @@ def _pictured(file: Path, width_mm: float | None, name: str) -> Target:
     return target
 
 
-def _refuse_unused(kind: str | None, board: Mapping[str, object]) -> None:
+def _refuse_unused(kind: str, board: BoardRequest) -> None:
     """Refuses options that have no effect."""
-    used = KINDS[kind].options.split() if kind is not None else []
-    default = vars(BoardOptions())
-    given = [name for name, value in board.items() if value != default[name] and name != "kind"]
+    used = KINDS[kind].options.split() if kind else []
+    names = [field.name for field in fields(BoardRequest) if field.name != "kind"]
+    given = [name for name in names if getattr(board, name) != getattr(BoardRequest, name)]
     options = ["--id" if name == "marker_id" else f"--{name.replace('_', '-')}" for name in given]
     unused = [option for option in options if option not in used]
     if unused:

@@ -20,13 +20,13 @@ from visioncal.cli.console import (
 from visioncal.cli.frame_options import TouchTestOptions
 from visioncal.cli.history import enter
 from visioncal.cli.locate import known_targets
-from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.conventions import POSE_FORMS, PoseForm, controller_form
 from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
 from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.parsing import numbers_in, refuse_given
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.touch_test import (
     TouchPoint,

@@ -10,12 +10,12 @@ import numpy as np
 
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.checkerboard import measure_squares, square_corners
 from visioncal.vision.boards.kind import (
     COUNTS,
     MM,
-    BoardRequest,
     Cells,
     DetectedCorners,
     NotFound,

@@ -11,12 +11,12 @@ from scipy.spatial import cKDTree
 
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target, chosen_rows
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import (
     COUNTS,
     MM,
-    BoardRequest,
     DetectedCorners,
     NotFound,
     counts_of,

@@ -14,9 +14,10 @@ from scipy.spatial.distance import cdist
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.circles import find_blobs
-from visioncal.vision.boards.kind import BoardRequest, DetectedCorners, NotFound, sigma_of
+from visioncal.vision.boards.kind import DetectedCorners, NotFound, sigma_of
 from visioncal.vision.boards.points import PointsKind, points_of
 from visioncal.vision.boards.prints import Print
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import (
     COUNTS,
     MM,
     BoardKind,
-    BoardRequest,
     Cells,
     DetectedCorners,
     NotFound,

@@ -15,6 +15,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards.template import Refined, unrefined
 
 # Relative sigma of a square by default: the scale error of office printers.
@@ -67,28 +68,6 @@ class Cells:
     dark: Mask  # (rows, columns) mask of dark cells.
     # (2, 2) rotation, with the directions of the grid's columns and rows as columns.
     turn: FloatArray = field(default_factory=lambda: np.eye(2))
-
-
-@dataclass(frozen=True)
-class BoardRequest:
-    """Requirements of a board; None and empty texts are chosen automatically."""
-
-    kind: str  # Kind of target.
-    # Number of squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along
-    # x.
-    columns: int | None = None
-    rows: int | None = None  # Likewise along y.
-    # Side of a square, or of the marker for a single marker and an AprilGrid [mm].
-    square_mm: float | None = None
-    marker_mm: float | None = None  # Side of the markers in a ChArUco board [mm].
-    dictionary: str = ""  # ArUco dictionary by OpenCV's name.
-    legacy: bool = False  # Whether a ChArUco board has OpenCV's layout before 4.6.
-    marker_id: int | None = None  # Id of a single marker; the first one of a board of markers.
-    name: str = ""  # Name of the target.
-    spacing: float | None = None  # Gap between the tags of an AprilGrid, as a share of their side.
-    border: int | None = None  # Number of dark modules around their bits.
-    diameter_mm: float | None = None  # Diameter of circles [mm].
-    asymmetric: bool = False  # Whether every second row of circles is shifted.
 
 
 class BoardKind(ABC):

@@ -6,11 +6,11 @@ import numpy as np
 
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards.board import DETECTED_WEIGHT
 from visioncal.vision.boards.kind import (
     MM,
     BoardKind,
-    BoardRequest,
     Cells,
     DetectedCorners,
     NotFound,

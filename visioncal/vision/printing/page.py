@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Target
+from visioncal.vision.board_request import BoardRequest
 from visioncal.vision.boards import KINDS, kind_of
-from visioncal.vision.boards.kind import BoardRequest
 from visioncal.vision.printing.pattern import Pattern, draw_pattern
 from visioncal.vision.targets import target_from_document
 
@@ -233,8 +233,8 @@ def requested_target(request: BoardRequest, pages: tuple[Page, ...]) -> Target:
     Raises:
         DataError: A requirement is missing or cannot be met.
     """
-    if request.square_mm is not None:
-        return _described(request, request.square_mm)
+    if request.side_mm is not None:
+        return _described(request, request.side_mm)
     smallest = _described(request, _SMALLEST_MM)
     largest = largest_side_mm(smallest, pages)
     if largest < _SMALLEST_MM:
