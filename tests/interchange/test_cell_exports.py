@@ -234,14 +234,14 @@ CELL = made_up_cell(4)
 def test_any_frame_is_written_in_any_other(tmp_path):
     write_json(tmp_path / "calibration.json", to_document(CELL))
     source = load_exportable(tmp_path)
-    text = export(source, "text", Selection("base_b_from_cam_top"))
+    text = export(source, "text", Selection(edge="base_b_from_cam_top"))
     expected = (
         invert(CELL.edges["cell_from_base_b"].matrix) @ CELL.edges["cell_from_cam_top"].matrix
     )
     # Numbers are written so that they read back as they are; the way takes a few roundings.
     assert np.allclose(np.loadtxt(io.StringIO(text)), expected, atol=1e-12)
     assert "aligned by visioncal from 'made up'" in text
-    turned = export(source, "text", Selection("base_b_from_cam_top", inverse=True))
+    turned = export(source, "text", Selection(edge="base_b_from_cam_top", inverse=True))
     assert np.allclose(np.loadtxt(io.StringIO(turned)) @ expected, np.eye(4), atol=1e-12)
 
 
@@ -261,18 +261,18 @@ def test_a_fixture_of_one_robot_is_written_in_the_base_of_another(name, sign):
     found = cell.between(*name.split("_from_"))
     np.testing.assert_allclose(found.matrix, far if sign > 0 else invert(far), atol=1e-12)
     np.testing.assert_allclose(found.covariance, whole, atol=1e-12)
-    text = export(cell, "text", Selection(name))
+    text = export(cell, "text", Selection(edge=name))
     assert np.allclose(np.loadtxt(io.StringIO(text)), found.matrix, atol=1e-12)
     assert "# verdict bad" in text
 
 
 def test_all_frames_are_one_tree():
-    found = list(yaml.safe_load_all(export(CELL, "ros", Selection("all"))))
+    found = list(yaml.safe_load_all(export(CELL, "ros", Selection(edge="all"))))
     hangs = {value["child_frame_id"]: value["header"]["frame_id"] for value in found}
     assert hangs == {
         name: on for name, on in CELL.cell.tree.items() if not name.startswith("flange")
     }
-    robot = ET.fromstring(export(CELL, "urdf", Selection("all")))
+    robot = ET.fromstring(export(CELL, "urdf", Selection(edge="all")))
     links = [element.attrib["name"] for element in robot.findall("link")]
     assert sorted(links) == sorted(["cell", *hangs])
     joints = {
@@ -280,14 +280,14 @@ def test_all_frames_are_one_tree():
         for element in robot.findall("joint")
     }
     assert joints == hangs
-    launch = export(CELL, "ros-launch", Selection("all"))
+    launch = export(CELL, "ros-launch", Selection(edge="all"))
     assert launch.count("static_transform_publisher") == len(hangs)
     compile(launch, "launch", "exec")
-    rows = np.loadtxt(io.StringIO(export(CELL, "text", Selection("all"))))
+    rows = np.loadtxt(io.StringIO(export(CELL, "text", Selection(edge="all"))))
     assert rows.shape == (4 * len(hangs), 4)
     # The verdict is that of the cell.
     bad = replace(CELL, verdict=replace(CELL.verdict, status="bad"))
-    assert document(bad, "ros", Selection("all")).verdict.status == "bad"
+    assert document(bad, "ros", Selection(edge="all")).verdict.status == "bad"
 
 
 def test_a_lens_is_that_of_the_camera_that_is_named():
@@ -307,10 +307,10 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
     ("to", "selection", "words"),
     [
         ("ros", Selection(), r"and one is written.*--edge \w+_from_cam_\w+"),
-        ("ros", Selection("base_a_from_target_plate"), "whose pose must be given"),
-        ("ros", Selection("base_a_from_cam_tpo"), "Did you mean cam_top"),
-        ("ros", Selection("all", inverse=True), "without --inverse, --parent and --child"),
-        ("opencv", Selection("all"), "written as ros, "),
+        ("ros", Selection(edge="base_a_from_target_plate"), "whose pose must be given"),
+        ("ros", Selection(edge="base_a_from_cam_tpo"), "Did you mean cam_top"),
+        ("ros", Selection(edge="all", inverse=True), "without --inverse, --parent and --child"),
+        ("opencv", Selection(edge="all"), "written as ros, "),
         ("easy-handeye", Selection(), "holds the camera"),
     ],
 )

@@ -24,7 +24,7 @@ from support.samples import made_up
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Camera
-from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
+from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_result_or_frames
 from visioncal.results import Calibration, CameraResult, Edge, FrameFile, Verdict
 from visioncal.results.depth import DepthCamera, DepthResult
@@ -63,9 +63,9 @@ def calibration(matrix, mount="eye-in-hand", **changes):
     return replace(SAMPLE, mount=mount, edges=edges, **changes)
 
 
-def wanted(name, *edge, **chosen):
+def wanted(name, edge=None, **chosen):
     """The selection of a frame; FANUC's formats want to know which number they set."""
-    return Selection(*edge, number=7 if name in NUMBERED else None, **chosen)
+    return Selection(edge=edge, number=7 if name in NUMBERED else None, **chosen)
 
 
 def off(name, text, matrix):
@@ -97,8 +97,8 @@ def test_any_edge_and_frame_and_its_inverse_are_exported(name):
     for source, there in ((SAMPLE, edges), (CELL, frames), (ALONE, frames)):
         for edge, matrix in there.items():
             # As above.
-            assert off(name, export(source, name, Selection(edge)), matrix) < 1e-9
-            inverse = export(source, name, Selection(edge, inverse=True))
+            assert off(name, export(source, name, Selection(edge=edge)), matrix) < 1e-9
+            inverse = export(source, name, Selection(edge=edge, inverse=True))
             assert off(name, inverse, invert(matrix)) < 1e-9
 
 
@@ -116,11 +116,11 @@ def test_the_depth_camera_is_a_frame_of_the_tree():
     x = SAMPLE.edges["flange_from_cam"].matrix
     for name, matrix in (("cam_from_depth", beside), ("flange_from_depth", x @ beside)):
         for to in ("ros", "urdf", "kuka", "text"):
-            assert off(to, export(source, to, Selection(name)), matrix) < 1e-9
-    stated = yaml.safe_load(export(source, "ros", Selection("cam_from_depth")))
+            assert off(to, export(source, to, Selection(edge=name)), matrix) < 1e-9
+    stated = yaml.safe_load(export(source, "ros", Selection(edge="cam_from_depth")))
     assert stated["header"]["frame_id"] == "camera_optical_frame"
     assert stated["child_frame_id"] == "camera_depth_optical_frame"
-    text = export(source, "text", Selection("flange_from_depth"))
+    text = export(source, "text", Selection(edge="flange_from_depth"))
     sigma_mm = float(text.partition("sigma ")[2].split()[0])
     spread = log(invert(x @ beside) @ x @ exp(RNG.multivariate_normal(
         np.zeros(6), SAMPLE.edges["flange_from_cam"].covariance, 20_000)) @ beside)  # fmt: skip
@@ -128,13 +128,13 @@ def test_the_depth_camera_is_a_frame_of_the_tree():
     worth = 1e3 * np.sqrt(np.trace(np.cov(spread[:, 3:].T)))
     assert sigma_mm == pytest.approx(worth, rel=0.06)  # of two digits
     # In the tree each frame has one parent.
-    joints = ET.fromstring(export(source, "urdf", Selection("all"))).findall("joint")
+    joints = ET.fromstring(export(source, "urdf", Selection(edge="all"))).findall("joint")
     ends = {(one.find("child").get("link"), one.find("parent").get("link")) for one in joints}
     assert ("camera_depth_optical_frame", "camera_optical_frame") in ends
     assert ("camera_optical_frame", "tool0") in ends
     assert len({child for child, _ in ends}) == len(joints)
     with pytest.raises(DataError, match="frame of a camera's body"):
-        export(source, "ros", Selection("flange_from_depth", child="camera_depth_frame"))
+        export(source, "ros", Selection(edge="flange_from_depth", child="camera_depth_frame"))
 
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
@@ -151,7 +151,7 @@ def test_the_inverse_carries_the_covariance_along():
     noise = RNG.multivariate_normal(np.zeros(6), edge.covariance, 20_000)
     moved = log(edge.matrix @ invert(edge.matrix @ exp(noise)))
     sampled_mm = 1e3 * np.sqrt(np.trace(np.cov(moved[:, 3:].T)))
-    worth = export(SAMPLE, "text", Selection(name, inverse=True)).splitlines()[1]
+    worth = export(SAMPLE, "text", Selection(edge=name, inverse=True)).splitlines()[1]
     stated_mm = float(worth.partition("sigma ")[2].split()[0])
     # 20,000 samples know a standard deviation to half a percent, and two digits are stated.
     assert abs(stated_mm / sampled_mm - 1) < 0.05
@@ -219,10 +219,10 @@ BODIES = ("camera_link", "arm/wrist_camera_link", "link", "camera_depth_frame", 
 def test_the_optical_pose_is_not_written_under_the_name_of_a_body(name):
     for body in BODIES:
         raised(DataError, f"{body}.*optical", export, SAMPLE, name, Selection(child=body))
-    back = Selection("flange_from_cam", inverse=True, parent="camera_link")
+    back = Selection(edge="flange_from_cam", inverse=True, parent="camera_link")
     if name in ANY_EDGE:
         raised(DataError, "camera_link.*optical", export, SAMPLE, name, back)
-        assert export(SAMPLE, name, Selection("base_from_target", child="board_link"))
+        assert export(SAMPLE, name, Selection(edge="base_from_target", child="board_link"))
     for optical in ("camera_color_optical_frame", "camera", "linked", "link_cam"):
         assert export(SAMPLE, name, Selection(child=optical))
 
@@ -234,7 +234,10 @@ def test_the_optical_pose_is_not_written_under_the_name_of_a_body(name):
             Selection(child_from_cam=stated(BODY)),
             "without a name.*--child camera_link.*--inverse.*--parent",
         ),
-        (Selection("base_from_target", child="a", child_from_cam=stated(BODY)), "for target under"),
+        (
+            Selection(edge="base_from_target", child="a", child_from_cam=stated(BODY)),
+            "for target under",
+        ),
         (Selection(child="a", child_from_cam=(0, 15, 0, 0, 0, 0, 1)), "0, 15, 0.*at most 3 m"),
         (Selection(child="a", child_from_cam=(0, 0, np.nan, 0, 0, 0, 1)), "missing"),
         (Selection(child="a", child_from_cam=(0, 0, 0, 0, 0, np.nan, 1)), "missing"),
@@ -548,7 +551,7 @@ def test_the_gripper_of_abbs_manual_is_written_as_printed():
     matrix = readers.transform(readers.ry(np.pi / 4), [0.0974, 0, 0.2231])
     # The manual's quaternion has three digits, by which a matrix is off by up to four times that.
     assert off("abb-tooldata", GRIPPER, matrix) < 2e-3
-    chosen = Selection(child="gripper", load=Load(5.0, (23.0, 0.0, 75.0)))
+    chosen = Selection(child="gripper", mass_kg=5.0, cog_mm=(23.0, 0.0, 75.0))
     ours = export(placed.alone(tool(matrix)), "abb-tooldata", chosen)
     kind, name, (held, (position, quaternion), load) = readers.rapid(ours)
     assert (kind, name) == readers.rapid(GRIPPER)[:2]
@@ -692,7 +695,8 @@ def test_the_only_frame_of_its_kind_is_taken_and_none_of_the_other(name):
 
 @pytest.mark.parametrize("name", sorted(FORMATS))
 def test_options_that_a_format_cannot_hold_are_refused(name):
-    given = {"number": {"number": 2}, "load": {"load": Load(1.0, (0.0, 0.0, 1.0))}}
+    load = {"mass_kg": 1.0, "cog_mm": (0.0, 0.0, 1.0)}
+    given = {"number": {"number": 2}, "mass_kg": load}
     for what, chosen in given.items():
         if what not in FORMATS[name].takes:
             raised(DataError, "no place for", export, CELL, name, Selection(**chosen))
@@ -705,8 +709,8 @@ TWO = replace(SAMPLE, frames=tool() | {"flange_from_tool_2": placed.frame(FLANGE
     ("source", "name", "chosen", "words"),
     [
         (SAMPLE, "rso", Selection(), "Did you mean ros"),
-        (SAMPLE, "ros", Selection("flange_from_cm"), "Did you mean flange_from_cam"),
-        (SAMPLE, "ros", Selection("cam_from_flange"), "--edge flange_from_cam --inverse"),
+        (SAMPLE, "ros", Selection(edge="flange_from_cm"), "Did you mean flange_from_cam"),
+        (SAMPLE, "ros", Selection(edge="cam_from_flange"), "--edge flange_from_cam --inverse"),
         (SAMPLE, "ros", Selection(parent="a", child="a"), "two frames"),
         (SAMPLE, "ur-tcp", Selection(), "visioncal tcp"),
         (replace(SAMPLE, camera=None), "camera-info", Selection(), "no camera"),
@@ -715,7 +719,7 @@ TWO = replace(SAMPLE, frames=tool() | {"flange_from_tool_2": placed.frame(FLANGE
         (CELL, "oak", Selection(), "eepromToJsonFile"),
         (CELL, "oak", Selection(onto="{}"), "is none of it"),
         (CELL, "oak", Selection(child="cam"), "CAM_A, CAM_B"),
-        (CELL, "abb-tooldata", Selection(load=Load(0.0, (0, 0, 1))), "mass above 0"),
+        (CELL, "abb-tooldata", Selection(mass_kg=0.0, cog_mm=(0, 0, 1)), "mass above 0"),
         (CELL, "ur-tcp", Selection(inverse=True), "the inverse of"),
         (TWO, "ur-tcp", Selection(), "flange_from_tool, flange_from_tool_2"),
         (ALONE, "text", Selection(), "flange_from_tool, base_from_fixture"),
@@ -741,7 +745,7 @@ def test_a_frame_has_its_own_origin_sigma_and_verdict():
     bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
     frames = tool(verdict=bad) | fixture(source="points.csv", verdict=Verdict("good"))
     cell = replace(SAMPLE, frames=frames, verdict=Verdict.of("bad", "The views disagree."))
-    notes = export(cell, "text", Selection(FIXTURE)).splitlines()
+    notes = export(cell, "text", Selection(edge=FIXTURE)).splitlines()
     origin = f"# calibrated by visioncal from 'points.csv', {placed.CREATED}: pivot over 10 touches"
     edge = frames[FIXTURE].edge
     quality = f"# verdict good; sigma {edge.sigma_mm:.2g} mm and {edge.sigma_deg:.2g} deg"

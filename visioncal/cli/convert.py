@@ -51,15 +51,7 @@ def convert_command(options: ConvertOptions) -> None:
             form=options.form,
             force=options.force,
             choose=choose,
-            mirrors_poses=options.mirror_poses,
-            exchange=options.exchange,
-            shift=options.shift,
-            turned=options.turned,
-            positions=options.positions,
-            without_tool=options.without_tool,
-            board_scale=options.board_scale,
-            mends_images=options.mend_images,
-            by_joints=options.by_joints,
+            mends=options,
         )
     for warning in session.warnings:
         say(f"note: {warning}")

@@ -67,7 +67,7 @@ def _correct_table(options: CorrectOptions, moved: tuple[FloatArray, FloatArray]
     # None where the table is printed.
     file = None if options.out == Path("-") else options.out
     needs = EYE if options.tool is not None and options.tool.removeprefix(_TOOLS) == "cam" else ARM
-    loaded = load_calibration(options.calibration, options.choice, needs)
+    loaded = load_calibration(options.calibration, options, needs)
     bad = check_usable(loaded.verdict, "the calibration", force=options.force)
     calibration, links_c = _at_temperatures(loaded, options.temperatures)
     arm = CalibratedArm.of(calibration, or_nominal=moved is not None)
@@ -156,7 +156,7 @@ def _correct_program(options: CorrectOptions, dialect: Dialect) -> None:
             "the corrected one.",
             culprits=["-o"],
         )
-    folder, calibration = options.out, load_calibration(options.calibration, options.choice, ARM)
+    folder, calibration = options.out, load_calibration(options.calibration, options, ARM)
     bad = check_usable(calibration.verdict, "the calibration", force=options.force)
     calibration, links_c = _at_temperatures(calibration, options.temperatures)
     arm = CalibratedArm.of(calibration)

@@ -5,8 +5,9 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from visioncal.cli.options import json_flag, out_folder, robot_name
+from visioncal.cli.options import json_flag, out_folder
 from visioncal.cli.session_options import ClearanceOptions, kept_option
+from visioncal.core.choice import robot_name
 from visioncal.core.choices import DYNAMICS_FILE, GAIN_SIGMA
 from visioncal.core.options import REQUIRED, argument, flag, numbers_option, option
 

@@ -1,34 +1,20 @@
 """`visioncal export`."""
 
-from dataclasses import fields
 from pathlib import Path
 
 import typer
 
 from visioncal.cli.console import check_usable, say, with_run_paths
 from visioncal.cli.result_options import ExportOptions
-from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, read_text, write_atomically
-from visioncal.interchange.exports import Load, Selection, document
+from visioncal.core.files import check_free, write_atomically
+from visioncal.interchange.exports import document
 from visioncal.interchange.result_files import load_exportable
 
 
 def export_command(options: ExportOptions) -> None:
     """Runs `visioncal export`."""
-    if (options.mass_kg is None) != (options.cog_mm is None):
-        raise DataError(
-            "A load is a mass and where its centre is.",
-            culprits=["--mass-kg", "--cog-mm"],
-            next_step="Give both --mass-kg and --cog-mm, or neither.",
-        )
-    load = None
-    if options.mass_kg is not None and options.cog_mm is not None:
-        load = Load(options.mass_kg, options.cog_mm)
-    onto = None if options.onto is None else read_text(options.onto)
-    given = {**vars(options), "load": load, "onto": onto}
-    selection = Selection(**{field.name: given[field.name] for field in fields(Selection)})
     with with_run_paths(options.source, options.source):
-        written = document(load_exportable(options.source), options.to, selection)
+        written = document(load_exportable(options.source), options.to, options)
     bad = check_usable(written.verdict, "what is exported", force=options.force)
     for warning in (*bad, *written.warnings):
         say(warning, "warning: ", "bold red")

@@ -6,18 +6,16 @@ from typing import ClassVar
 
 from visioncal.cli.options import (
     ActOptions,
-    PartOptions,
     against_option,
-    camera_name,
     example_flag,
     force_bad,
     force_flag,
     form_option,
     json_flag,
-    robot_name,
     session_argument,
 )
 from visioncal.cli.session_options import RobotPoseOptions
+from visioncal.core.choice import Choice, camera_name, robot_name
 from visioncal.core.choices import (
     UNITS_M,
 )
@@ -26,7 +24,7 @@ from visioncal.core.parsing import FORMS, POSE
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameOptions(RobotPoseOptions, PartOptions, ActOptions):
+class FrameOptions(RobotPoseOptions, Choice, ActOptions):
     """Source and destination of a frame."""
 
     touches: Path | None = argument(

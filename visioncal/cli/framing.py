@@ -199,7 +199,7 @@ def place_frame(
         place = _place(request, kind, Choice(robot=request.robot), ARM, touched_by)
         frame = by_touches(source, place.calibration)
     else:
-        place = _place(request, kind, replace(request.choice, target=None), EYE)
+        place = _place(request, kind, replace(request, target=None), EYE)
         if place.calibration is None:
             raise DataError(
                 f"session {session.name!r} has images, and the camera's calibration (-c) is needed "
@@ -208,7 +208,7 @@ def place_frame(
                 next_step="Name the output folder of visioncal calibrate.",
             )
         if has_several(session):
-            session = select(session, request.choice, robot_between=False)
+            session = select(session, request, robot_between=False)
         point_m = np.array(request.point or np.zeros(3))
         with shown_progress(quiet=request.as_json) as progress:
             frame = seen_frame(session, place.calibration, kind, point_m, progress=progress)

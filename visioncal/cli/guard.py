@@ -34,7 +34,7 @@ def guard_command(options: GuardOptions) -> None:
     if options.scene is not None:
         _by_scene(options, options.scene)
         return
-    calibration = load_result(options.against).chosen(options.choice)
+    calibration = load_result(options.against).chosen(options)
     guard = Guard(calibration, false_alarm_looks=options.false_alarm_looks, slow_mm=options.slow_mm)
     if options.state is not None and options.state.exists():
         try:
@@ -76,7 +76,7 @@ def guard_command(options: GuardOptions) -> None:
 def _by_scene(options: GuardOptions, images: Path) -> None:
     """Answers each of a session's images of the standing scene."""
     session, calibration = select_matching(
-        Session.load(images), load_result(options.against), options.choice
+        Session.load(images), load_result(options.against), options
     )
     looks = scene_looks(
         session,

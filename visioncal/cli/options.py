@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
@@ -11,10 +11,6 @@ from visioncal.core.choices import SITE_FILE, ImagesKept
 from visioncal.core.options import REQUIRED, argument, flag, option
 from visioncal.core.parsing import address_in
 from visioncal.interchange.outputs import RECORDING, REPORT
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.session.selecting import Choice
 
 
 def example_flag(name: str) -> Any:  # noqa: ANN401 - as `option`
@@ -42,8 +38,6 @@ form_option = partial(
 )
 yes_flag = partial(flag, "Do not ask: the cell is clear, a hand on the stop button.", "--yes")
 seed_option = partial(option, "Random seed.", "--seed", default=0, min=0)
-camera_name = partial(option, "Of a whole cell: which camera, as left.", "--camera")
-robot_name = partial(option, "Of a whole cell: which robot, as a.", "--robot")
 against_option = partial(
     option, "The calibration: an output folder of calibrate, or its .rrd.", default=REQUIRED
 )
@@ -52,22 +46,6 @@ against_option = partial(
 def out_folder(words: str = "The folder to write into.", *names: str, **attributes: object) -> Any:  # noqa: ANN401
     """The option of a folder to write into; see `option`."""
     return option(words, *(names or ("-o", "--out")), file_okay=False, **attributes)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartOptions:
-    """Choice of a camera, a robot and a target of a cell."""
-
-    camera: str | None = camera_name()
-    robot: str | None = robot_name()
-    target: str | None = option("Of a whole cell: which target, as floor.")
-
-    @property
-    def choice(self) -> "Choice":
-        """The choice, for sessions and results."""
-        from visioncal.session.selecting import Choice
-
-        return Choice(self.camera, self.robot, self.target)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -105,7 +105,7 @@ def verify_on_page(options: VerifyOptions) -> None:
 
     def prepare(setup: Setup) -> Task:
         against = Path(setup.against)
-        calibration = load_calibration(against, options.choice)
+        calibration = load_calibration(against, options)
         fit, lens = calibration.joint_fit, calibration.camera
         boards = {} if fit is None else fit.targets
         if lens is None or len(boards) != 1:

@@ -122,7 +122,7 @@ def recover_command(options: RecoverOptions) -> None:
     path = options.stops or options.folder / "stops"
     act = _opened(options, loaded)
     stated = causes = act.stated
-    session, old = select_matching(_recorded(options, act, path), loaded, options.choice)
+    session, old = select_matching(_recorded(options, act, path), loaded, options)
     with (
         _step(options, act, "result"),
         shown_progress(quiet=False) as progress,

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, get_args
+from typing import ClassVar
 
 import typer
 
@@ -11,7 +11,6 @@ from visioncal.cli.options import (
     ActOptions,
     NeedOptions,
     PageOptions,
-    PartOptions,
     WorkOptions,
     against_option,
     example_flag,
@@ -23,6 +22,7 @@ from visioncal.cli.options import (
     out_file,
     out_folder,
 )
+from visioncal.core.choice import Choice
 from visioncal.core.choices import (
     SITE_FILE,
     WIDEST_RAD,
@@ -33,8 +33,9 @@ from visioncal.core.choices import (
 )
 from visioncal.core.limits import RecoveryLimits
 from visioncal.core.options import REQUIRED, argument, flag, numbers_option, option
-from visioncal.core.parsing import POSE, serial_in, views_in
+from visioncal.core.parsing import serial_in, views_in
 from visioncal.interchange.outputs import REPORT, VERIFY
+from visioncal.interchange.selection import Selection
 
 
 def _show_formats(wanted: bool) -> None:
@@ -139,7 +140,7 @@ class ShowOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyOptions(PartOptions, PageOptions, ActOptions):
+class VerifyOptions(Choice, PageOptions, ActOptions):
     """Check whether a calibration still holds, and what has changed if it does not.
 
     With --page SESSION is a folder of checks: a browser leads through five stops of one of the
@@ -167,7 +168,7 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GuardOptions(PartOptions):
+class GuardOptions(Choice):
     """Say after each look of a working cell whether its calibration still holds.
 
     Looks come as JSON lines on stdin; each is answered by a JSON line. A line has time_s,
@@ -257,7 +258,7 @@ class LoadOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecoverOptions(LoadOptions, PartOptions, ActOptions):
+class RecoverOptions(LoadOptions, Choice, ActOptions):
     """Recover a calibration after a knock: new stops, the cause, and a new zero or calibration.
 
     FOLDER holds the whole act: started again, it goes on where it was ended. It drives nothing:
@@ -289,7 +290,7 @@ class RecoverOptions(LoadOptions, PartOptions, ActOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiffOptions(PartOptions):
+class DiffOptions(Choice):
     """Show what changed between two calibrations, and what is only noise.
 
     Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
@@ -301,7 +302,7 @@ class DiffOptions(PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions(PartOptions):
+class ExportOptions(Selection):
     """Write a result, or the calibrated arm, in another program's or robot's format.
 
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
@@ -312,32 +313,12 @@ class ExportOptions(PartOptions):
     source: Path = argument("An output folder, its .json, a recording, or a file of frames.")
     to: str = option("A format, as ros or ur; see --list.", default=REQUIRED, metavar="FORMAT")
     out: Path | None = out_file()
-    edge: str | None = option("The transform, or all; of a cell any frame from any other.")
-    inverse: bool = flag("Write the inverse of it.")
-    parent: str | None = option("Exported name of the frame in which the pose is given.")
-    child: str | None = option("Exported name of the frame whose pose it is.")
-    child_from_cam: tuple[float, ...] | None = numbers_option(
-        "Pose of the camera's optical frame in --child, where that is another, as camera_link [m].",
-        form=POSE,
-    )
-    number: int | None = option("Number of the controller's tool or base.")
-    mass_kg: float | None = option("The tool's mass, for ABB's tooldata (kg).")
-    cog_mm: tuple[float, float, float] | None = option(
-        "Its centre of mass in the flange: X Y Z (mm)."
-    )
-    lens: str | None = option(
-        "A poorer model of the lens, refitted; what it leaves is said.",
-        metavar="pinhole|radtan|plumb_bob",
-    )
-    onto: Path | None = option("For oak: the device's own calibration, as depthai saves it.")
-    convention: str | None = option("Of robot-dh's table.", metavar="|".join(get_args(Convention)))
-    calibration_hash: str | None = option("Hash of ur_calibration, for ur-kinematics.", "--hash")
     force: bool = force_both()
     _list: bool = flag("List the formats.", "--list", callback=_show_formats, is_eager=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectOptions(LoadOptions, PartOptions):
+class CorrectOptions(LoadOptions, Choice):
     """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named. Exit

@@ -29,13 +29,8 @@ from visioncal.core.choices import (
 from visioncal.core.options import REQUIRED, SIZE, argument, flag, numbers_option, option
 from visioncal.core.parsing import (
     names_in,
-    pairs_in,
-    places_in,
-    scale_in,
-    shift_in,
-    tool_in,
-    turn_in,
 )
+from visioncal.interchange.mends import Mends, mend_option
 from visioncal.live.capture.devices import CAMERAS
 from visioncal.live.capture.options import Stillness
 from visioncal.planning.purposes import PURPOSES
@@ -56,7 +51,6 @@ _poses = partial(option, panel="The poses of a foreign recording")
 _names = partial(_poses, parse=names_in)
 _recording = partial(option, panel="The recording itself")
 _camera = partial(option, panel="Its camera")
-_doubt = partial(option, panel="Poses that may be misread, of a session as well")
 
 Instrument: TypeAlias = Literal["point", "points", "probe"]
 # Largest number of stops where a need decides it.
@@ -340,16 +334,9 @@ class RobotPoseOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConvertOptions(RobotPoseOptions):
-    """Write a session as a folder or a recording, or make one of another program's.
+class ForeignOptions(RobotPoseOptions):
+    """Options for a foreign recording."""
 
-    Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
-    nothing was written, and the message says what is missing or wrong.
-    """
-
-    first: ClassVar = "target mount images robot_form robot_model intrinsics guess yes force"
-    source: Path = argument("A session's folder, its .rrd, or a foreign file or folder.")
-    dest: Path = argument("An .rrd, or the folder to write.")
     form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")
     mount: Mount | None = _recording("Where the camera is, or that it is an instrument.")
     instrument: str | None = _recording(
@@ -372,43 +359,22 @@ class ConvertOptions(RobotPoseOptions):
     )
     intrinsics: str | None = _camera("A file of any form, or `estimate` to ignore the source's.")
     resolution: tuple[int, int] | None = _camera("Size of the images in pixels.", **SIZE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(Mends, ForeignOptions):
+    """Write a session as a folder or a recording, or make one of another program's.
+
+    Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
+    nothing was written, and the message says what is missing or wrong.
+    """
+
+    first: ClassVar = "target mount images robot_form robot_model intrinsics guess yes force"
+    source: Path = argument("A session's folder, its .rrd, or a foreign file or folder.")
+    dest: Path = argument("An .rrd, or the folder to write.")
     force: bool = force_flag()
-    guess: bool = _doubt("Try other readings, and print them.", "--guess", default=False)
-    yes: bool = _doubt("Take one that stands out.", "--yes", default=False, needs="guess")
-    mirror_poses: bool = _doubt(
-        "Mirror left-handed poses.", "--mirror-poses", default=False, needs="guess"
-    )
-    exchange: tuple[int, ...] | None = _doubt(
-        "Pairs of views whose images are exchanged, one after the other: 8,17,9,16.", parse=pairs_in
-    )
-    shift: tuple[tuple[int, ...], int] | None = _doubt(
-        "Views whose poses stand so many rows later: 12-24:2.", parse=shift_in
-    )
-    turned: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
-        "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60; or, by 0 "
-        "degrees, shifted to it. By degrees alone: whose pictures are turned.",
-        parse=turn_in,
-    )
-    positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = _doubt(
-        "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.",
-        parse=places_in,
-    )
-    without_tool: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
-        "Views whose poses are of a tool's tip, and the tool, in mm and by a rotation vector in "
-        "degrees: 3,7:0,0,140,0,0,30. It is taken off them.",
-        parse=tool_in,
-    )
-    board_scale: tuple[str, float] | None = _doubt(
-        "True over stated size of the board: 1.01, or, of several, left:1.01. Poses that were "
-        "measured by it are scaled along.",
-        parse=scale_in,
-    )
-    by_joints: bool = _doubt(
-        "Take the poses of the joint angles, not the reported ones.", "--by-joints", default=False
-    )
-    mend_images: bool = _doubt(
-        "Mirror, turn and scale images back.", "--mend-images", default=False
-    )
+    guess: bool = mend_option("Try other readings, and print them.", "--guess", default=False)
+    yes: bool = mend_option("Take one that stands out.", "--yes", default=False, needs="guess")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ def verify_command(options: VerifyOptions) -> None:
     if options.output is not None:
         refuse_calibration(options.output)
     loaded, calibration = select_matching(
-        Session.load(options.session), load_result(against), options.choice
+        Session.load(options.session), load_result(against), options
     )
     with shown_progress(quiet=options.as_json) as progress:
         check = verify(
@@ -103,7 +103,7 @@ def _verify_performance(options: VerifyOptions) -> None:
     from visioncal.verification.iso9283 import performance
 
     loaded, calibration = select_matching(
-        Session.load(options.session), load_result(options.against), options.choice
+        Session.load(options.session), load_result(options.against), options
     )
     with shown_progress(quiet=options.as_json):
         tested = performance(loaded, calibration)

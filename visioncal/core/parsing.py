@@ -3,8 +3,10 @@
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 from visioncal.core.errors import DataError
+from visioncal.core.files import read_text
 from visioncal.core.number_format import some_of
 
 # A pose of the robot, as typed.
@@ -130,6 +132,12 @@ def address_in(words: str, option: str) -> tuple[str, int]:
     is_right = bool(host) and port.isdecimal() and 0 < int(port) < 1 << 16
     _check(is_right, words, option, "a host and a port up to 65535, as 0.0.0.0:8321")
     return host, int(port)
+
+
+def text_in(words: str, option: str) -> str:
+    """Reads the text of a file; raises DataError."""
+    _check(bool(words), words, option, "a path")
+    return read_text(Path(words))
 
 
 def names_in(words: str, option: str) -> tuple[str, ...]:

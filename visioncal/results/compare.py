@@ -153,7 +153,7 @@ def compare(
         DataError: There is none of that name, or a name is needed.
     """
     choice = Choice(camera, robot, target)
-    if choice or a.cell is None or b.cell is None:
+    if not choice.is_any or a.cell is None or b.cell is None:
         # Names select from whole cells; where neither is one, `chosen` refuses them.
         neither = a.cell is None and b.cell is None
         a, b = (

@@ -216,7 +216,7 @@ class Calibration(CalibrationSections):
         """
         if self.cell is not None:
             return replace(self, **selected_fields(self, self.cell, choice, needs))
-        if choice:
+        if not choice.is_any:
             raise DataError(
                 f"calibration {self.session_name!r} is of one camera and one robot, which have no "
                 "names.",

@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
+from visioncal.core.choice import Choice
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, ranges, some_of
 from visioncal.core.types import Mount
@@ -21,21 +22,6 @@ PARTS: tuple[Part, ...] = get_args(Part)
 EYE: tuple[Part, ...] = ("camera", "robot")
 ARM: tuple[Part, ...] = ("robot",)
 LENS: tuple[Part, ...] = ("camera",)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Names of a camera, a robot and a target; None for any.
-
-    A name is that of the session's table, as `left`, or of the frame, as `cam_left`.
-    """
-
-    camera: str | None = None
-    robot: str | None = None
-    target: str | None = None
-
-    def __bool__(self) -> bool:
-        return any(name is not None for name in (self.camera, self.robot, self.target))
 
 
 # The choice without names.
@@ -199,7 +185,7 @@ def select(
 
     Where no camera is needed, the rows are those without images with the robot's pose.
     """
-    if not choice and not has_several(session):
+    if choice.is_any and not has_several(session):
         return session
     chosen = chosen_of(session, choice, needs, robot_between=robot_between)
     if not has_several(session):
@@ -334,7 +320,7 @@ def is_whole_cell(session: "Session") -> bool:
 
 def must_select_one(session: "Session", choice: Choice) -> bool:
     """Whether one of each must be selected; several boards of one camera and robot need not be."""
-    return is_whole_cell(session) or (bool(choice) and has_several(session))
+    return is_whole_cell(session) or (not choice.is_any and has_several(session))
 
 
 def check_one_of_each(session: "Session") -> None:

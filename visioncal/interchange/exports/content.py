@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -15,6 +15,7 @@ from visioncal.core.number_format import did_you_mean, figure
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.frames.naming import PARENTS, FrameKind
+from visioncal.interchange.selection import Load, Selection
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
 from visioncal.session.frames import frames_of_kind
@@ -217,46 +218,7 @@ Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
 # Fields of a selection that select a part of a cell, and those of any transform.
 _PARTS = ("camera", "robot", "target")
 OF_TRANSFORMS = ("edge", "inverse", "parent", "child", "child_from_cam")
-_OPTIONS = {
-    "load": "--mass-kg and --cog-mm",
-    "calibration_hash": "--hash",
-    "child_from_cam": "--child-from-cam",
-}
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True)
-class Load:
-    """A tool's load, which no calibration determines."""
-
-    mass_kg: float
-    centre_mm: tuple[float, float, float]  # Its centre of mass in the flange's frame.
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The choice of an export; None leaves it to the format."""
-
-    # A transform by name; None for the camera's, or in a format of tools or fixtures for the only
-    # one of its kind.
-    edge: str | None = None
-    inverse: bool = False
-    parent: str | None = None  # Exported name of the frame in which the pose is given.
-    # Exported name of the frame whose pose it is; the camera, in a format of lenses.
-    child: str | None = None
-    # Pose [m] of the camera's optical frame in a frame called `child`, which is then exported in
-    # its place: x, y, z, qx, qy, qz, qw.
-    child_from_cam: tuple[float, ...] | None = None
-    number: int | None = None  # Number of the controller's tool or base.
-    load: Load | None = None
-    convention: str | None = None
-    calibration_hash: str | None = None  # The `hash` of a UR's own kinematics.
-    camera: str | None = None  # A camera of a cell, in a format of lenses.
-    # A robot of a cell: its part is exported as of one camera and robot.
-    robot: str | None = None
-    target: str | None = None  # A target of a cell; likewise.
-    lens: str | None = None  # A poorer model of the lens, as of `lenses.POORER`.
-    onto: str | None = None  # An existing document, all else of which is kept.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -332,13 +294,17 @@ class Format(Generic[_T]):
 
     def check(self, selection: Selection, also: Collection[str] = ()) -> None:
         """Refuses options that are neither in `takes` nor in `also`; raises DataError."""
-        given = [name for name, option in vars(selection).items() if option not in (None, False)]
-        unused = [name for name in given if name not in (*self.takes, *also, *_PARTS)]
+        names = [each.name for each in fields(Selection)]
+        given = [name for name in names if getattr(selection, name) not in (None, False)]
+        unused = [
+            f"--{name.replace('_', '-').removeprefix('calibration-')}"
+            for name in given
+            if name not in (*self.takes, *also, *_PARTS)
+        ]
         if unused:
             raise DataError(
-                f"{self.name} has no place for "
-                f"{', '.join(_OPTIONS.get(name, f'--{name}') for name in unused)}.",
-                culprits=[f"--{name}" for name in unused],
+                f"{self.name} has no place for {', '.join(unused)}.",
+                culprits=unused,
                 next_step="Leave it out.",
             )
 

@@ -38,7 +38,7 @@ from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
 from visioncal.results import Calibration, Edge, Verdict
 from visioncal.session.frames import frame_name
-from visioncal.session.selecting import ARM, EYE, PARTS, Choice
+from visioncal.session.selecting import ARM, EYE, PARTS
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ROS_FORMATS,
@@ -150,8 +150,8 @@ def _robot_part(
     if names == (None, None) and not is_arm:
         return source, selection
     of_robot = ARM if isinstance(form, ArmFormat) or form.holds in ("tool", "fixture") else EYE
-    choice = Choice(selection.camera, selection.robot, selection.target)
-    part = source.chosen(choice, PARTS if selection.target is not None and not is_arm else of_robot)
+    needs = PARTS if selection.target is not None and not is_arm else of_robot
+    part = source.chosen(selection, needs)
     edge = selection.edge
     if edge is not None and selection.robot is not None:
         # The robot's part has its frames without its name.

@@ -209,7 +209,8 @@ ROBOTS = (
             name,
             words,
             partial(_write, name.partition("-")[0], statement),
-            takes=frozenset(mark for mark in ("number", "load") if f"{{{mark}}}" in statement),
+            takes=frozenset(("number",) * ("{number}" in statement))
+            | frozenset(("mass_kg", "cog_mm") * ("{load}" in statement)),
             warn=_warn_of_load if "{load}" in statement else lambda _: (),
             holds="tool" if holds == "tool" else "fixture",
         )

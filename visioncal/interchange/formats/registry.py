@@ -44,6 +44,7 @@ from visioncal.interchange.formats.rereading import (
 from visioncal.interchange.formats.settling import settled
 from visioncal.interchange.formats.sources import describe, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID
+from visioncal.interchange.mends import Mends
 from visioncal.session import Session
 from visioncal.session.selecting import is_whole_cell
 
@@ -63,7 +64,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     VIEWS,
 )
 
-_DEFAULTS = ImportOptions()
+_DEFAULTS, _NO_MENDS = ImportOptions(), Mends()
 _FREE_LENSES = replace(_DEFAULTS, intrinsics="estimate")
 
 # Tries other readings of the poses, and selects one.
@@ -79,15 +80,7 @@ def convert(
     form: str | None = None,
     force: bool = False,
     choose: Choose | None = None,
-    mirrors_poses: bool = False,
-    exchange: tuple[int, ...] | None = None,
-    shift: tuple[tuple[int, ...], int] | None = None,
-    turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
-    positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = None,
-    without_tool: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
-    board_scale: tuple[str, float] | None = None,
-    mends_images: bool = False,
-    by_joints: bool = False,
+    mends: Mends = _NO_MENDS,
 ) -> Session:
     """Writes a session or a foreign recording as a session's folder or as a recording.
 
@@ -101,18 +94,8 @@ def convert(
         force: Whether an existing file may be replaced; a folder never is.
         choose: Called with what was read, unless the only reading that agrees with the images or
             the target's poses contradicts nothing stated; returns the reading to apply.
-        mirrors_poses: Whether that reading may mirror the robot's poses.
-        exchange: Pairs of views whose images, corners and readings are exchanged.
-        shift: Views whose poses of the robot stand so many rows later (earlier where negative).
-        turned: Views in which the board was read turned in its plane; by which angle [deg], and
-            about which point of the board [mm] (x, y). With an angle alone, pictures are turned.
-        positions: Views whose positions are sums of columns, and these sums by axis: pairs of a
-            factor and a column's name.
-        without_tool: Views whose poses are of a tool's tip, and the tool in the flange: place [mm]
-            and rotation vector [deg].
-        board_scale: A board's name, empty for the only one, and its true over its stated size.
-        mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
-        by_joints: Whether the robot's poses are those of its joint angles, not the reported ones.
+        mends: What is mended, views and images; and whether that reading may mirror the robot's
+            poses.
 
     Returns:
         The session.
@@ -155,23 +138,23 @@ def convert(
     else:
         doubtful = load_for_rereading(source)
     if choose is not None:
-        session = _reread(doubtful, choose, requested.progress, mirrors_poses=mirrors_poses)
-    mends: tuple[tuple[Callable[..., Session], tuple[object, ...] | None], ...] = (
-        (exchange_views, exchange),
-        (shift_views, shift),
-        (turn_boards, turned),
-        (write_positions, positions),
-        (remove_tool, without_tool),
-        (scale_board, board_scale),
+        session = _reread(doubtful, choose, requested.progress, mirrors_poses=mends.mirror_poses)
+    of_views: tuple[tuple[Callable[..., Session], tuple[object, ...] | None], ...] = (
+        (exchange_views, mends.exchange),
+        (shift_views, mends.shift),
+        (turn_boards, mends.turned),
+        (write_positions, mends.positions),
+        (remove_tool, mends.without_tool),
+        (scale_board, mends.board_scale),
     )
-    for mend, asked in mends:
+    for mend, asked in of_views:
         session = session if asked is None else mend(session, *asked)
     for mend_whole, is_asked in (
         (without_stated_lenses, is_session and requested == _FREE_LENSES),
-        (without_reported_poses, by_joints),
+        (without_reported_poses, mends.by_joints),
     ):
         session = mend_whole(session) if is_asked else session
-    if mends_images:
+    if mends.mend_images:
         session = mend_images(session, requested.progress)
     write_session(session, dest)
     return session
