@@ -78,7 +78,7 @@ def test_a_bag_is_the_session_that_it_was_made_of(form, options, source, rendere
     session = convert(path, tmp_path / "out", requested=asked)
     assert session.mount == "eye-in-hand"
     assert said[-1][1] == said[-1][2]
-    assert session.declaration.camera.matrix == LENS["matrix"]
+    assert [*session.declaration.camera.matrix] == LENS["matrix"]
     assert len(session.views) == len(source.views)
     flange = motion_of(session, None, "robot").flange
     late_s = options.get("camera_late_s", 0.0)
@@ -226,7 +226,7 @@ def test_poses_frames_and_lenses_may_be_named(source, rendered, tmp_path):
     session = convert(path, tmp_path / "out", requested=asked)
     assert len(session.views) == len(source.views)
     assert session.declaration.camera.resolution == source.declaration.camera.resolution
-    assert session.declaration.camera.matrix == LENS["matrix"]
+    assert [*session.declaration.camera.matrix] == LENS["matrix"]
     frames = bag(tmp_path / "frames", source, rendered, is_compressed=True)
     wrong = replace(BOARD, robot=PoseImportOptions(("base_link", "tool1")))
     caught = raised(DataError, "no 'tool1'", convert, frames, tmp_path / "none", requested=wrong)

@@ -142,14 +142,25 @@ def row_words(views: Sequence[int]) -> str:
 
 
 def known_name(
-    what: str, name: str, known: Collection[_Name], culprit: str = "", next_step: str = ""
+    what: str,
+    name: str,
+    known: Collection[_Name],
+    culprit: str = "",
+    next_step: str = "",
+    of: str = "",
 ) -> _Name:
-    """The name, if it is among known ones; else raises DataError with a similar one."""
+    """The name, if it is among known ones, of an owner; else raises DataError with a similar one.
+
+    `next_step` is the advice where none is similar.
+    """
     for each in known:
         if each == name:
             return each
+    names = some_of([*known], 20) or "none"
     raise DataError(
-        f"There is no {what} named {name[:80]!r}; the names are {some_of([*known], 20)}.",
+        f"{of} has no {f'{what} {name[:80]!r}'.strip()}; it has {names}."
+        if of
+        else f"There is no {what} named {name[:80]!r}; the names are {names}.",
         culprits=[culprit or name],
         next_step=did_you_mean(name, known) or next_step,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import DynamicsLimits
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 from visioncal.core.threads import on_one_blas_thread
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.differences import scale_difference, stream_differences
@@ -221,13 +221,7 @@ def robot_of(session: Session) -> Robot:
 def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
     """Names of the wanted streams; by default of all with torques or currents."""
     for name in wanted:
-        if name not in session.streams:
-            raise DataError(
-                f"session {session.name!r} has no stream {name!r}; it has "
-                f"{', '.join(session.streams) or 'none'}.",
-                culprits=[name],
-                next_step=did_you_mean(name, session.streams),
-            )
+        known_name("stream", name, session.streams, of=f"session {session.name!r}")
     if wanted:
         return list(dict.fromkeys(wanted))
     drives = ("tau1_nm", "current1_a")

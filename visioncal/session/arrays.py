@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 from visioncal.core.transforms import LAST_ROW, rigid_fault
 from visioncal.core.types import Camera, FloatArray, Image, Image16, IntArray, Mount, Target
 from visioncal.session.columns import POSE
@@ -121,11 +121,7 @@ def _content(
 ) -> dict[str, Any]:
     count, known = len(matrices), [*CellArguments.__annotations__]
     for name in cell.keys() - known:
-        raise DataError(
-            f"{name} must be one of {', '.join(known)}.",
-            culprits=[name],
-            next_step=did_you_mean(name, known),
-        )
+        known_name("argument", name, known)
     if not count:
         raise DataError("There are no views.", culprits=["base_from_flange"])
     q = np.asarray(cell.get("q", np.zeros((count, 0))), dtype=float)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 from visioncal.core.transforms import cross, exp
 from visioncal.core.types import FloatArray
 
@@ -246,12 +246,7 @@ def arm_named(name: str) -> DhArm:
         "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
         "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
     }
-    if name not in SIMULATED_ARMS:
-        raise DataError(
-            f"simulation: the arm {name!r} is not known, only {', '.join(SIMULATED_ARMS)} are.",
-            culprits=["robot"],
-            next_step=did_you_mean(name, SIMULATED_ARMS) or "Name one of these.",
-        )
+    known_name("simulated arm", name, SIMULATED_ARMS, "robot", "Name one of these.")
     a, d, quarters = [0.18, 0.8, 0.18, 0, 0, 0], [0.5, 0, 0, 0.8, 0, 0.13], [-1, 0, -1, 1, -1, 0]
     if name in published:
         d1, a2, a3, d4, d5, d6 = published[name]

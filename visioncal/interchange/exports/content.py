@@ -11,7 +11,7 @@ import yaml
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
-from visioncal.core.number_format import did_you_mean, figure
+from visioncal.core.number_format import did_you_mean, figure, known_name
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.frames.naming import PARENTS, FrameKind
@@ -153,14 +153,8 @@ def placements(source: Source, camera: str | None = None) -> Placements:
     }
     lens = next(iter(lenses.values())) if len(lenses) == 1 else None
     if camera is not None:
-        frame = next((name for name in (camera, f"cam_{camera}") if name in lenses), None)
-        if frame is None:
-            raise DataError(
-                f"The camera {camera!r} must be one of this cell: {', '.join(lenses) or 'none'}.",
-                culprits=["--camera"],
-                next_step=did_you_mean(camera, list(lenses)),
-            )
-        lens = lenses[frame]
+        frame = camera if camera in lenses else f"cam_{camera}"
+        lens = lenses[known_name("camera", frame, lenses, "--camera", of="This cell")]
     return Placements(edges | frames, tuple(frames), "this cell", None, lens, source, lenses)
 
 

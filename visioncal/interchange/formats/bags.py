@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.calibration.stages.motion import is_standing_still
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.number_format import known_name, some_of
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.interchange.formats.bag_messages import BagContents, BagImages, contents_of
@@ -113,8 +113,7 @@ def _cameras(contents: BagContents, requested: ImportOptions) -> dict[str, str]:
     if requested.image is not None:
         asked = [name.strip() for name in requested.image.split(",")]
         for name in asked:
-            if name not in topics:
-                raise _no_topic(name, topics, "--image-key")
+            _check_named(name, topics, "--image-key")
         topics = asked
     # Of one camera, raw images come before compressed ones, and unrectified before rectified ones.
     topics.sort(key=lambda name: ("compressed" in name, "rect" in name))
@@ -158,12 +157,8 @@ def _depths(
     return found
 
 
-def _no_topic(name: str, names: Sequence[str], option: str) -> DataError:
-    return DataError(
-        f"The bag has no {name!r}; it has {some_of(list(names), 20)}.",
-        culprits=[name],
-        next_step=did_you_mean(name, names) or f"Say {option} with one of these.",
-    )
+def _check_named(name: str, names: Sequence[str], option: str) -> None:
+    known_name("", name, names, next_step=f"Say {option} with one of these.", of="The bag")
 
 
 def _lens(contents: BagContents, topic: str, notes: list[str]) -> dict[str, Any]:
@@ -194,7 +189,9 @@ def _motion(
     """The robot's motion, where it is from, the tip's frame in TF if any, and the robot's model."""
     names, tip = requested.robot.names, ""
     if len(names) == 1 and names[0] not in contents.poses:
-        raise _no_topic(names[0], [*contents.poses, *contents.parents], "--robot-key BASE,TIP")
+        # One frame alone is no pose.
+        others = [name for name in contents.parents if name != names[0]]
+        _check_named(names[0], [*contents.poses, *others], "--robot-key BASE,TIP")
     is_named_pose = len(names) == 1
     if not is_named_pose and contents.moving:
         base, tip = names[:2] if len(names) > 1 else _ends(contents)
@@ -288,8 +285,7 @@ def _between(contents: BagContents, base: str, tip: str) -> tuple[FloatArray, Fl
     """(m,) times and (m, 4, 4) `base_from_tip` by TF."""
     known = {*contents.parents, *contents.parents.values()}
     for name in (base, tip):
-        if name not in known:
-            raise _no_topic(name, sorted(known), "--robot-key BASE,TIP")
+        _check_named(name, sorted(known), "--robot-key BASE,TIP")
     up, down = contents.chain(base), contents.chain(tip)
     common = next((name for name in up if name in down), "")
     sides = [chain[: chain.index(common) + 1] if common else [] for chain in (up, down)]

@@ -22,7 +22,7 @@ from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.extras import client_library
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, read_text
-from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.number_format import known_name, some_of
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.interchange.formats.file_search import path_inside
 from visioncal.interchange.formats.foreign import (
@@ -246,13 +246,8 @@ def _camera_of(source: Path, info: _Info, key: str | None) -> str:
     """The key of the images that are wanted, by default the first; raises DataError."""
     cameras = [name for name in info.features if name.startswith(_IMAGES)]
     key = key or next(iter(cameras), "")
-    if key not in cameras:
-        raise DataError(
-            f"{source}: no images {key!r}; it has {some_of(cameras, 20) or 'none'}.",
-            culprits=[key],
-            next_step=did_you_mean(key, cameras) or "Name one with --image-key.",
-        )
-    return key
+    step = "Name one with --image-key."
+    return known_name("images", key, cameras, next_step=step, of=str(source))
 
 
 def episode_frames(
