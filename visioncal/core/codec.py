@@ -98,17 +98,22 @@ class WrittenForm:
     form: type | None = None  # The dataclass that is written; None for plain JSON.
 
 
-# Marks of fields: INLINE puts the keys among those of the owner, REST collects all unknown keys.
-INLINE, REST = object(), object()
+# Marks of fields: INLINE puts the keys among those of the owner, REST collects all unknown keys,
+# BY_NAME reads a tuple of records from tables by their names.
+INLINE, REST, BY_NAME = object(), object(), object()
 # KEPT is written even if empty, DROPPED (a text or number) is not written if empty, UNWRITTEN
 # never.
 KEPT, DROPPED, UNWRITTEN = object(), object(), object()
 Vector = Annotated[FloatArray, Array((-1,))]
 Matrix = Annotated[FloatArray, Array((-1, -1))]
-Finite = Annotated[float, Check("a number", math.isfinite)]
+Finite = Annotated[float, Check("a finite number", math.isfinite)]
 Count = Annotated[int, Check("a whole number from 1 on", lambda value: value >= 1)]
 NotNegative = Annotated[float, Check("0 or more", lambda value: 0.0 <= value < math.inf)]
 Positive = Annotated[float, Check("a number above 0", lambda value: 0.0 < value < math.inf)]
+
+
+class Strict:
+    """Base of records that users write alone: unknown keys are refused."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,6 +219,10 @@ def read_fields(cls: type, document: object, path: str) -> dict[str, Any]:
     table, known_fields = _table(document, path), entries(cls)
     known_keys = set().union(*(entry.keys for entry in known_fields))
     values, faults = dict[str, Any](), list[DataError]()
+    for key in table.keys() - known_keys if issubclass(cls, Strict) else ():
+        place, known = _joined(path, key), [entry.key for entry in known_fields]
+        words = f"{place} is not known; the fields are {', '.join(known)}."
+        faults.append(DataError(words, culprits=[place], next_step=did_you_mean(key, known)))
     for entry in known_fields:
         try:
             if REST in entry.marks:
@@ -278,11 +287,20 @@ def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see
             return _converted(mark.read, path, content, path)
         if isinstance(mark, Lenient):
             value = _converted(mark.convert, path, value)
+        if mark is BY_NAME:
+            return _read_by_name(get_args(inner)[0], value, path)
     checked = read_value(inner, value, path)
     for mark in marks:
         if isinstance(mark, Check) and not mark.fits(checked):
             raise type_error(value, mark.needed, path, _similar(value, mark.names))
     return checked
+
+
+def _read_by_name(kind: Any, value: Any, path: str) -> tuple[Any, ...]:  # noqa: ANN401
+    if not all(isinstance(each, Mapping) for each in (value, *getattr(value, "values", tuple)())):
+        raise type_error(value, f"tables [{path}.NAME]", path)
+    rows = ((name, {**row, "name": name}) for name, row in value.items())
+    return tuple(read_value(kind, row, _joined(path, name)) for name, row in rows)
 
 
 def _converted(convert: Callable[..., Any], path: str, *given: object) -> Any:  # noqa: ANN401

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.choices import SIMULATED_ARMS
+from visioncal.core.codec import NotNegative, Strict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import known_name
 from visioncal.core.transforms import cross, exp
@@ -97,10 +98,10 @@ class DhArm:
 
 
 @dataclass(frozen=True)
-class Payload:
+class Payload(Strict):
     """A load on the flange, and a force on it."""
 
-    kg: float = 0.0  # Mass [kg].
+    kg: NotNegative = 0.0  # Mass [kg].
     # Centre of mass in the flange frame [m].
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Force on the flange's origin, in the base frame [N].
@@ -119,18 +120,19 @@ class Payload:
 class ArmOptions:
     """An arm, standard deviations of the real one from it, and its payloads."""
 
-    dh_sigma_m: float = 0.0  # Every length a and d [m].
-    dh_sigma_rad: float = 0.0  # Every alpha, beta and joint offset [rad].
-    offset_sigma_rad: float = 0.0  # Joint offsets, in addition to `dh_sigma_rad` [rad].
+    dh_sigma_m: NotNegative = 0.0  # Every length a and d [m].
+    dh_sigma_rad: NotNegative = 0.0  # Every alpha, beta and joint offset [rad].
+    offset_sigma_rad: NotNegative = 0.0  # Joint offsets, in addition to `dh_sigma_rad` [rad].
     # Sine and cosine amplitudes of the joint errors at the joint's angle [rad].
-    eccentricity_sigma_rad: float = 0.0
-    ripple_sigma_rad: float = 0.0  # Likewise for the gear's ripple, many times per turn [rad].
+    eccentricity_sigma_rad: NotNegative = 0.0
+    # Likewise for the gear's ripple, many times per turn [rad].
+    ripple_sigma_rad: NotNegative = 0.0
     # Further joint errors as arbitrary functions of the angle [rad].
-    function_sigma_rad: float = 0.0
-    function_length_rad: float = 0.06  # Correlation length of these functions [rad].
+    function_sigma_rad: NotNegative = 0.0
+    function_length_rad: NotNegative = 0.06  # Correlation length of these functions [rad].
     robot: str = "ur10e"  # A name among `SIMULATED_ARMS`.
-    robot_sigma_m: float = 3e-5  # Repeatability of the flange's position, per axis [m].
-    robot_sigma_rad: float = 5e-5  # Repeatability of its rotation, per axis [rad].
+    robot_sigma_m: NotNegative = 3e-5  # Repeatability of the flange's position, per axis [m].
+    robot_sigma_rad: NotNegative = 5e-5  # Repeatability of its rotation, per axis [rad].
     # Compliance of each joint; empty for a rigid arm.
     compliance_rad_per_nm: tuple[float, ...] = ()
     payloads: tuple[Payload, ...] = ()  # Payloads, cycled over the stops; empty for none.

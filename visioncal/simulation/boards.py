@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from visioncal.core.codec import within
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.vision.targets import corner_positions, extent_m, load_target, rotation_transforms
 
@@ -56,10 +58,10 @@ class Sheet:
     """A printed target on its plate."""
 
     target: Target  # Target as designed.
-    scale: float = 1.0  # Printed size over stated size.
+    scale: Annotated[float, within(0.5, 2.0)] = 1.0  # Printed size over stated size.
     # Depth of the pattern's outer corners relative to its centre, positive away from a camera in
     # front of it [m].
-    bow_m: float = 0.0
+    bow_m: Annotated[float, within(-0.05, 0.05)] = 0.0
 
 
 def corners_m(sheet: Sheet) -> FloatArray:

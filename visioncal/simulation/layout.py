@@ -3,15 +3,27 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
 from visioncal.core.arguments import check_fields
-from visioncal.core.codec import Count, WrittenForm, type_error
+from visioncal.core.codec import (
+    BY_NAME,
+    Check,
+    Count,
+    Finite,
+    Key,
+    NotNegative,
+    Strict,
+    WrittenForm,
+    type_error,
+    within,
+)
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.session import frame_name
+from visioncal.session.document import NAME
 from visioncal.simulation.arms import ArmOptions
 from visioncal.simulation.boards import BOARDS, TARGETS, Sheet
 from visioncal.simulation.optics import CAMERAS
@@ -20,6 +32,15 @@ from visioncal.simulation.poses import Motion, Viewpoints
 # Centre of the cell, which robots face [m].
 MIDDLE_M = (0.0, 0.0, 0.4)
 CELL = "cell"
+Place: TypeAlias = tuple[Finite, Finite, Finite]
+Whole: TypeAlias = Annotated[int, Check("a whole number from 0 on", lambda value: value >= 0)]
+ThingName: TypeAlias = Annotated[
+    str,
+    Check(
+        f"a name of letters, digits and _ after a letter, and not {CELL!r}",
+        lambda name: NAME.fullmatch(name) is not None and name != CELL,
+    ),
+]
 # Board names in the session of a cell with two boards.
 _TWO_BOARDS = ("first", "second")
 
@@ -76,12 +97,12 @@ _KEPT = (
 class DrawOptions:
     """Random seed of a cell, and the noise of corners."""
 
-    pixel_sigma_px: float = 0.05  # Noise of simulated detections, per axis [px].
+    pixel_sigma_px: NotNegative = 0.05  # Noise of simulated detections, per axis [px].
     # Seed of everything random. Each source of randomness has its own stream, so that changing one
     # option does not change the draws of others.
-    seed: int = 0
+    seed: Whole = 0
     # Number of the recording of the same cell and arms, with stops and noise of its own.
-    recording: int = 0
+    recording: Whole = 0
 
     def stream(self, purpose: RandomStream, *index: int) -> np.random.Generator:
         """Generator of one source of randomness; `index` is of the thing or the view."""
@@ -99,28 +120,28 @@ class CameraOptions:
     camera: Annotated[Camera, _named(CAMERAS)] = CAMERAS["wide"]  # True optics.
     state_intrinsics: bool = True  # Whether the session states the intrinsics.
     # Error of the stated intrinsics, as root mean square over the image [px].
-    lens_mismatch_px: float = 0.0
-    blur_px: float = 0.7  # Defocus of rendered images, as a Gaussian's sigma [px].
-    image_noise: float = 2.0  # Noise of rendered images [grey levels].
-    vignetting: float = 0.2  # Relative loss of light in the image's corners.
-    jpeg_quality: int | None = None  # 1 to 100; None writes lossless PNG.
+    lens_mismatch_px: NotNegative = 0.0
+    blur_px: NotNegative = 0.7  # Defocus of rendered images, as a Gaussian's sigma [px].
+    image_noise: NotNegative = 2.0  # Noise of rendered images [grey levels].
+    vignetting: NotNegative = 0.2  # Relative loss of light in the image's corners.
+    jpeg_quality: Whole | None = None  # 1 to 100; None writes lossless PNG.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
     """Timing and noise of a sweep."""
 
-    stops: int = 12  # Number of postures on its path.
-    pace_s: float = 1.7  # Time between postures [s].
-    robot_hz: float = 125.0  # Samples of the controller per second.
-    frames_hz: float = 30.0  # Frames of the camera per second.
+    stops: Whole = 12  # Number of postures on its path.
+    pace_s: NotNegative = 1.7  # Time between postures [s].
+    robot_hz: NotNegative = 125.0  # Samples of the controller per second.
+    frames_hz: NotNegative = 30.0  # Frames of the camera per second.
     # Time from an image's first row to its last, with the stamp at the middle [s]; 0 for a global
     # shutter.
-    readout_s: float = 0.0
+    readout_s: NotNegative = 0.0
     # Offset of the camera's clock relative to the controller's [s].
-    camera_minus_robot_s: float = 0.0
-    jitter_s: float = 0.0  # Standard deviation of the camera's stamps [s].
-    encoder_sigma_rad: float = 2e-6  # Noise of the reported joint angles [rad].
+    camera_minus_robot_s: Finite = 0.0
+    jitter_s: NotNegative = 0.0  # Standard deviation of the camera's stamps [s].
+    encoder_sigma_rad: NotNegative = 2e-6  # Noise of the reported joint angles [rad].
 
     def __post_init__(self) -> None:
         if self.stops < 2 or min(self.pace_s, self.robot_hz, self.frames_hz) <= 0.0:
@@ -128,117 +149,121 @@ class SweepOptions:
 
 
 @dataclass(frozen=True)
-class RobotAt(ArmOptions):
+class RobotAt(Strict, ArmOptions):
     """A robot in the cell, facing the centre."""
 
-    name: str  # Name in the session.
-    place_m: tuple[float, float, float]  # Position of its base in the cell [m].
+    name: ThingName  # Name in the session.
+    place_m: Place  # Position of its base in the cell [m].
     robot: str = field(default="ur5e", kw_only=True)
     warms_up: bool = False  # Whether it is cold at the first stop and warms up while it works.
-    wrong_stops: int = 0  # Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
+    wrong_stops: Whole = 0  # Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
 
 
 @dataclass(frozen=True, eq=False)
-class CameraAt(CameraOptions):
+class CameraAt(Strict, CameraOptions):
     """A camera on a robot's flange, or fixed in the cell."""
 
-    name: str  # Name in the session.
+    name: ThingName  # Name in the session.
     on: str = CELL  # The robot that carries it, or `cell`.
-    place_m: tuple[float, float, float] = (0.0, -1.0, 1.1)  # Position in the cell, if fixed [m].
-    looks_at_m: tuple[float, float, float] = MIDDLE_M  # Point that a fixed one looks at [m].
+    place_m: Place = (0.0, -1.0, 1.1)  # Position in the cell, if fixed [m].
+    looks_at_m: Place = MIDDLE_M  # Point that a fixed one looks at [m].
     at_stops: bool = True  # Whether it takes images at the robots' stops, and not only in sweeps.
 
 
 @dataclass(frozen=True)
-class BoardAt(Sheet):
+class BoardAt(Strict, Sheet):
     """A board on a robot's flange, or fixed in the cell."""
 
-    name: str  # Name in the session.
+    name: ThingName  # Name in the session.
     on: str = CELL  # The robot that carries it, or `cell`.
     # Position of its centre in the cell, if fixed [m].
-    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tilt_rad: float = 0.0  # Tilt towards the centre of the cell [rad].
+    place_m: Place = (0.0, 0.0, 0.0)
+    tilt_rad: Finite = 0.0  # Tilt towards the centre of the cell [rad].
     target: Annotated[Target, _named(TARGETS)] = field(default=BOARDS["charuco"], kw_only=True)
 
 
 @dataclass(frozen=True)
-class PointAt:
+class PointAt(Strict):
     """A point read by instruments, on a flange or in the cell."""
 
-    name: str  # Name in the session.
+    name: ThingName  # Name in the session.
     on: str  # The robot that carries it, or `cell`.
-    place_m: tuple[float, float, float]  # Position in the frame of that flange, or of the cell [m].
+    place_m: Place  # Position in the frame of that flange, or of the cell [m].
 
 
 @dataclass(frozen=True)
-class InstrumentAt:
+class InstrumentAt(Strict):
     """An upright instrument in the cell that reads every point at every stop.
 
     If it also reads rotations, points are probes, with the axes of the flange.
     """
 
-    name: str  # Name in the session.
-    place_m: tuple[float, float, float]  # Position in the cell [m].
-    turn_rad: float = 0.0  # Rotation about the vertical [rad].
-    sigma_m: float = 1.5e-5  # Noise of readings, per axis [m].
-    sigma_rad: float = 0.0  # Noise of rotation readings [rad]; 0 if it reads no rotations.
+    name: ThingName  # Name in the session.
+    place_m: Place  # Position in the cell [m].
+    turn_rad: Finite = 0.0  # Rotation about the vertical [rad].
+    sigma_m: NotNegative = 1.5e-5  # Noise of readings, per axis [m].
+    sigma_rad: NotNegative = 0.0  # Noise of rotation readings [rad]; 0 if it reads no rotations.
 
 
 @dataclass(frozen=True)
-class Moved:
+class Moved(Strict):
     """A component that is pushed during the recording."""
 
     frame: str  # Frame that moves on its parent, as `target_floor` or `cam_left`.
-    from_stop: int | None = None  # First stop after the push; None for half way.
-    shift_m: float = 0.005  # Length of the displacement, in a random direction [m].
-    turn_rad: float = 0.01  # Angle of the rotation, about a random axis [rad].
+    from_stop: Whole | None = None  # First stop after the push; None for half way.
+    shift_m: Finite = 0.005  # Length of the displacement, in a random direction [m].
+    turn_rad: Finite = 0.01  # Angle of the rotation, about a random axis [rad].
     # Whether it creeps by so much instead, evenly up to its place at the last stop.
     creeps: bool = False
 
 
 @dataclass(frozen=True)
-class Swept(SweepOptions):
+class Swept(Strict, SweepOptions):
     """A camera that observes a target during a robot's motion, which carries one of the two."""
 
     camera: str  # The camera.
     robot: str  # The robot, which moves smoothly through its stops.
     target: str  # The target.
-    stops: int = field(default=10, kw_only=True)
-    frames_hz: float = field(default=10.0, kw_only=True)
+    stops: Whole = field(default=10, kw_only=True)
+    frames_hz: NotNegative = field(default=10.0, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkOptions(DrawOptions):
+class NetworkOptions(Strict, DrawOptions):
     """A simulated cell of several robots, cameras and boards; by default two, two and three.
 
     All poses deviate slightly from the stated ones. There is no occlusion.
     """
 
     # The robots.
-    robots: tuple[RobotAt, ...] = (RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02)))
+    robots: Annotated[tuple[RobotAt, ...], BY_NAME] = (
+        RobotAt("a", (-0.6, 0.0, 0.0)),
+        RobotAt("b", (0.6, 0.05, 0.02)),
+    )
     # The cameras.
-    cameras: tuple[CameraAt, ...] = (
+    cameras: Annotated[tuple[CameraAt, ...], BY_NAME] = (
         CameraAt("left", place_m=(0.0, -1.0, 1.1)),
         CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=CAMERAS["fine"]),
     )
     # The boards.
-    boards: tuple[BoardAt, ...] = (
+    boards: Annotated[tuple[BoardAt, ...], BY_NAME, Key("targets")] = (
         BoardAt("floor", place_m=(0.0, 0.0, 0.05)),
         BoardAt("plate_a", "a", target=BOARDS["checkerboard"]),
         BoardAt("plate_b", "b"),
     )
-    instruments: tuple[InstrumentAt, ...] = ()  # The instruments.
-    points: tuple[PointAt, ...] = ()  # Points that these read.
+    instruments: Annotated[tuple[InstrumentAt, ...], BY_NAME] = ()  # The instruments.
+    points: Annotated[tuple[PointAt, ...], BY_NAME] = ()  # Points that these read.
     stops: Count = 30  # Number of stops, common to all robots.
-    pace_s: float = 0.0  # Time between stops [s]; 0 for rows without a time.
-    share_seen: float = 1.0  # Share of the possible observations that is recorded, at random.
+    pace_s: NotNegative = 0.0  # Time between stops [s]; 0 for rows without a time.
+    # Share of the possible observations that is recorded, at random.
+    share_seen: Annotated[float, within(1e-6, 1.0)] = 1.0
     # Number of images of each camera for its intrinsics only, with a hand-held board.
-    lens_views: int = 0
+    lens_views: Whole = 0
     moved: tuple[Moved, ...] = ()  # Components that are pushed during the recording.
     sweeps: tuple[Swept, ...] = ()  # Sweeps after the stops.
     # Number of pairs of rows of one camera and board whose images are exchanged.
-    swapped_rows: int = 0
-    stray_images: int = 0  # Number of rows whose image is from another stop.
+    swapped_rows: Whole = 0
+    stray_images: Whole = 0  # Number of rows whose image is from another stop.
 
     def __post_init__(self) -> None:
         check_fields(self, "simulation")
@@ -302,8 +327,8 @@ class Second(Sheet):
     target: Target = BOARDS["checkerboard"]
     # Angle around the base from the first board (eye-in-hand), or direction of its offset on the
     # flange (eye-to-hand) [rad].
-    turn_rad: float = 1.4
-    tilt_rad: float = 0.3  # Tilt: towards the base, or sideways [rad].
+    turn_rad: Finite = 1.4
+    tilt_rad: Finite = 0.3  # Tilt: towards the base, or sideways [rad].
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
