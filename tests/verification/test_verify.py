@@ -198,7 +198,7 @@ def test_poses_of_another_unit_and_a_bad_calibration_are_named(pairs, tmp_path):
     replace(session, columns=columns, views=in_mm).save(tmp_path / "mm")
     done = visioncal("verify", tmp_path / "mm", "--against", pairs / "out")
     assert done.status == 3
-    assert f"visioncal doctor {tmp_path / 'mm'}" in done.out
+    assert "With the robot's positions in mm" in done.out
     document = json.loads((pairs / "out/calibration.json").read_text("utf-8"))
     document["verdict"] |= {"status": "bad"}
     (tmp_path / "calibration.json").write_text(json.dumps(document), "utf-8")
@@ -309,6 +309,8 @@ def test_changes_that_no_stop_separates_are_named_together(place):
     first = checked(place, rng, slip(1, 0.05))
     assert set(names(first)) == {"joint 1", "board"}
     assert "No stops separate that from" in verdict_of(first).reasons[1]
+    # A probability of the first beside that would say that they are separated.
+    assert "%" not in verdict_of(first).top[0]
     assert set(names(checked(place, rng, slip(6, 0.05)))) == {"joint 6", "camera"}
     # One stop is no robot that scatters.
     found = checked(place, rng, Change(board=knock(rng, 2.0, 0.0)), stops=1)

@@ -1,6 +1,6 @@
 """Calibrates a session, of one camera and robot or of a whole cell: the whole path, as a page."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Unpack
@@ -20,12 +20,13 @@ from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.board_points import with_board_points
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.suspects.misread_poses import with_open_chains
+from visioncal.calibration.suspects.misread_poses import misreadings, with_open_chains
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Corners, Progress, Rejection, Searched
+from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -193,6 +194,11 @@ STAGES: tuple[Stage, ...] = (
     Stage("examine", _examine),
     Stage("judge", judge_run),
 )
+
+
+def misread_poses(state: RunState) -> Iterator[Finding]:
+    """Findings on other readings of a run's poses that explain what its camera sees."""
+    yield from misreadings(state)
 
 
 def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:

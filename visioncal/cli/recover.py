@@ -140,7 +140,7 @@ def recover_command(options: RecoverOptions) -> None:
                 answer(f"nothing has changed: {options.against} holds. {verdict.top[0]}")
                 raise typer.Exit
             causes = causes or causes_found(check)
-            if check.explained and not causes:
+            if (check.explained or check.misread is not None) and not causes:
                 _ask_cause(check, verdict)
             if not stated:
                 _ask_side(options, old, causes)
@@ -226,10 +226,12 @@ def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:
     kinds = ("camera", "board", "joint")
     alike = [[change.name] for change in check.named if change.cause.kind in kinds]
     how = "Look which of them it is, and say so:"
+    for line in ("what to recover is not known:", *verdict.top):
+        answer(line)
     if len(check.named) == 1 or not alike:
         print_steps(verdict.next_steps)
         alike, how = [], "Or record more stops, as --count 30, or name each --cause."
-    for line in ("what to recover is not known:", *verdict.top, how, *map(_with_causes, alike)):
+    for line in (how, *map(_with_causes, alike)):
         answer(line)
     raise typer.Exit(EXIT_BAD)
 

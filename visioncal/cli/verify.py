@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from visioncal.cli.console import EXIT_BAD, answer, report_written
+from visioncal.cli.console import EXIT_BAD, answer, report_written, with_run_paths
 from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
@@ -47,7 +47,10 @@ def verify_command(options: VerifyOptions) -> None:
     loaded, calibration = select_matching(
         Session.load(options.session), load_result(against), options
     )
-    with shown_progress(quiet=options.as_json) as progress:
+    with (
+        shown_progress(quiet=options.as_json) as progress,
+        with_run_paths(options.session, against),
+    ):
         check = verify(
             loaded, calibration, board_placed_anew=options.board_moved, progress=progress
         )

@@ -84,6 +84,11 @@ def causes_of(
         # Camera and board together fit any two stops.
         if len(prior.boards) == 1 and predicted.stops >= FEWEST_VIEWS:
             causes.append(_simultaneous(BOTH, camera, place))
+    # All lengths of an arm by a share place its flange farther from the base by the same share.
+    ((_, poses),) = predicted.problem.poses.items()
+    farther = np.zeros((len(poses), 6, 1))
+    farther[:, 3:, 0] = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    causes.append(ChangeHypothesis(LENGTH, np.ones(1), flange_jacobian=farther))
     causes += _joints(predicted, prior)
     if predicted.stops > 1:
         # The robot's noise may have grown by 2 to 32 times.
@@ -138,7 +143,7 @@ def nominal_model(predicted: PredictedStops, prior: CalibrationPrior) -> ArmMode
 
 
 def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
-    """An offset of each joint, and a common scale of all lengths."""
+    """An offset of each joint, and how far stated loads bend them."""
     model = prior.model or nominal_model(predicted, prior)
     observed = predicted.observed
     q = observed.arm_at(observed.first_of_stops(observed.used)).joints_rad
@@ -151,12 +156,6 @@ def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Chan
         name = f"{JOINT} {joint + 1}"
         yield ChangeHypothesis(name, unit, flange_jacobian=by_flange, at=joint)
     yield from _load(predicted, prior, model, offsets)
-    # All lengths by a share: a placement's offset is in the frame before it, its twist after it.
-    placements = arm.chain.placements
-    twists = np.zeros((len(placements), 6))
-    twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
-    stretch = arm.placement_jacobian(q) @ twists.reshape(-1, 1)
-    yield ChangeHypothesis(LENGTH, np.ones(1), flange_jacobian=stretch)
 
 
 def _load(

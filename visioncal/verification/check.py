@@ -20,7 +20,8 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
 from visioncal.verification.calibration_prior import CalibrationPrior
-from visioncal.verification.change_hypotheses import CAMERA, NOISE, PAIRS, causes_of
+from visioncal.verification.change_hypotheses import CAMERA, LENGTH, NOISE, PAIRS, causes_of
+from visioncal.verification.misreading import misreading
 from visioncal.verification.model_evidence import (
     ChangeHypothesis,
     HypothesisEvidence,
@@ -33,6 +34,8 @@ from visioncal.verification.prediction import PredictedStops, board_changes, pre
 _LIMITS = CheckLimits()
 # Prior sigma of a board that was moved on purpose, around where it is seen [rad and m].
 _ANYWHERE = 1.0
+# Greatest share by which an arm grows, four times as by 100 K of aluminium.
+_MOST_GROWTH = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,11 @@ class PossibleChange:
     def name(self) -> str:
         """Kind of the change and its part: `camera`, `board NAME`, `joint 3`, `view 7` ..."""
         return self.cause.name
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether an arm can have grown by so much, where that is the change."""
+        return self.cause.kind != LENGTH or abs(self.explained.values[0]) < _MOST_GROWTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +75,7 @@ class Check:
     # nothing has changed.
     named: tuple[PossibleChange, ...]
     explained: bool  # Whether the likeliest change leaves no more residuals than noise.
+    misread: Finding | None = None  # Misreading of the poses that explains what no change does.
     depth: tuple[Finding, ...] = ()  # Whether depth still is what it was, where there is some.
 
     @property
@@ -75,9 +84,14 @@ class Check:
         return self.prior.calibration
 
     @property
+    def agrees(self) -> bool:
+        """Whether the stops agree with the calibration."""
+        return not self.named and self.misread is None and self.p_value >= _LIMITS.unexplained
+
+    @property
     def passed(self) -> bool:
         """Whether the stops agree with the calibration, and their depth."""
-        return not self.named and all(found.kind != DEPTH_CHANGED for found in self.depth)
+        return self.agrees and all(found.kind != DEPTH_CHANGED for found in self.depth)
 
     @property
     def camera_sigma(self) -> FloatArray:
@@ -183,16 +197,21 @@ def check(
         for index in np.argsort(-scores, kind="stable")
     )
     is_changed = evidence - unchanged.likelihood >= np.log(_LIMITS.likelihood_ratio)
-    named = _not_separated(compared) if is_changed else ()
+    p_value = float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom))
+    best, freedom = compared[0], compared[0].explained.freedom
+    # Without degrees of freedom, or by larger noise, everything is explained.
+    limit = f_limit(_LIMITS.unexplained, freedom, prior.freedom) if freedom > 0 else np.inf
+    is_noise = best.cause.kind == NOISE
+    is_explained = is_noise or best.explained.misfit < max(freedom, 1) * limit
+    is_cell = is_explained and not is_noise and best.is_possible
+    is_open = not is_cell if is_changed else p_value < _LIMITS.unexplained
+    misread = misreading(predicted.run) if is_open else None
+    named = _not_separated(compared) if is_changed and misread is None else ()
     changes = remaining = log(predicted.away(prior))
     if named:
         likeliest = named[0].cause
         corrected = undone(problem, likeliest, named[0].explained.values)
         remaining = log(board_changes(corrected, with_change(belief.state, likeliest)))
-    best, freedom = compared[0], compared[0].explained.freedom
-    # Without degrees of freedom, or by larger noise, everything is explained.
-    limit = f_limit(_LIMITS.unexplained, freedom, prior.freedom) if freedom > 0 else np.inf
-    is_explained = best.cause.kind == NOISE or best.explained.misfit < max(freedom, 1) * limit
     return Check(
         predicted,
         prior,
@@ -200,10 +219,11 @@ def check(
         remaining,
         0 if belief.repeated is None else len(belief.repeated.repeats),
         unchanged,
-        float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom)),
+        p_value,
         compared,
         named,
         bool(is_explained),
+        misread,
     )
 
 

@@ -44,6 +44,10 @@ from visioncal.vision.targets import corner_positions
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 # Changes of a smaller probability are not listed.
 _LISTED_SHARE = 1e-3
+# A mount that gives way farther hangs; another tool of the controller is farther away.
+_LOOSE_MM, _LOOSE_DEG = 20.0, 5.0
+_OR_TOOL = ", or another tool was active in the controller"
+_OR_JOINT = ", or a joint slipped, as rows with joint angles (q1_rad ...) would show"
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
 _SIZE_WORDS = (
     "the {board} is {percent} % {larger} (sigma {sigma}) than it was: it was printed again or "
@@ -59,13 +63,22 @@ _OTHER_POSES = Remedy(
     "and the convention of the calibrated ones, which doctor finds.",
     "visioncal doctor SESSION",
 )
+_BELONG = Remedy(
+    "Look whether poses, images and corners of each row belong together, which doctor finds; then "
+    "verify again.",
+    "visioncal doctor SESSION",
+)
+_OTHER_TOOL = Remedy(
+    "Look whether the controller's tool is that of the calibrated poses, and take the stops again "
+    f"with it; where the camera or the board was mounted anew, {_ANEW}"
+)
 _PAIR_AGAIN = Remedy(
     "Bring the images to the rows of their poses; then verify again.", "visioncal doctor SESSION"
 )
 # Words for each kind of change, a part of a sentence, and the advice on it.
 _KINDS = {
     CAMERA: (
-        "the camera {moved}{or_base}",
+        "the camera {moved}{or_frame}",
         Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW),
     ),
     LENS: (
@@ -74,7 +87,7 @@ _KINDS = {
         Remedy(f"Fasten its focus, and {_ANEW}", CALIBRATE_ANEW),
     ),
     BOARD: (
-        "the {name} {moved}{or_base}",
+        "the {name} {moved}{or_frame}",
         Remedy(
             "Put the board back; if it was moved on purpose, verify without its place.",
             f"{AGAIN} --board-moved",
@@ -111,7 +124,7 @@ _KINDS = {
         ),
     ),
     NOISE: (
-        "the robot scatters about {factor:.0f} times as much as it did",
+        "the robot scatters about {factor:.0f} times as much as it did{or_joint}",
         Remedy(
             "Look for play in mounts and joints, and whether the robot stood still at each image; "
             "then verify again.",
@@ -143,8 +156,13 @@ def verdict_of(check: Check) -> Verdict:
         words = f"{_stops(check)} can hardly distinguish one change from another."
         step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
         few.append(Finding("few_stops", words, step))
+    if check.misread is not None:
+        return Verdict("bad", (*bad, check.misread, *check.depth))
     if not check.named:
-        findings = (Finding(AGREEMENT, _agreement(check)), *check.depth, *bad, *few)
+        agreement = Finding(AGREEMENT, _agreement(check))
+        if not check.agrees:
+            agreement = Finding("unexplained", _contradiction(check), _BELONG)
+        findings = (agreement, *check.depth, *bad, *few)
         if not check.passed:
             # The change comes first.
             order = sorted(findings, key=lambda found: found.kind != DEPTH_CHANGED)
@@ -152,15 +170,13 @@ def verdict_of(check: Check) -> Verdict:
         return Verdict("check" if bad or few else "good", findings)
     likeliest, *others = check.named
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
-    # Where something else has changed, too, its probability among those compared says little.
+    # Where something else has changed, too, its probability among those compared says little; and
+    # beside changes that are not separated it would say that they are.
     share, is_alone = likeliest.probability, check.explained
-    found, step = _estimates(check, likeliest), _runnable(check, _KINDS[kind][1])
-    # No camera or board moves farther; poses in another unit seem to.
-    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
-        step = _OTHER_POSES
-    if kind == PAIRING:
-        step = _exchange(likeliest.cause.pairs)
-    reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
+    is_separated = all(rival.probability * CheckLimits.ruled_out >= share for rival in others)
+    is_limit = not is_alone or not is_separated
+    step = _step(check, likeliest)
+    reasons = [Finding(kind, words, step, probability=share, by_limit=is_limit)]
     if others:
         reasons.append(_rivals(check, likeliest, others))
     if not check.explained:
@@ -168,6 +184,20 @@ def verdict_of(check: Check) -> Verdict:
         anew = _runnable(check, Remedy(_sentence(_ANEW), CALIBRATE_ANEW))
         reasons.append(Finding("unexplained", words, anew))
     return Verdict("bad", (*bad, *reasons, *check.depth, *(few if others else ())))
+
+
+def _step(check: Check, change: PossibleChange) -> Remedy:
+    """Advice on the likeliest change."""
+    if change.cause.kind == PAIRING:
+        return _exchange(change.cause.pairs)
+    found = _estimates(check, change)
+    move = found.get(CAMERA, found)
+    # No camera or board moves farther, and no arm grows so; poses in another unit seem to.
+    if move.get("moved_mm", 0.0) > 5e3 or not change.is_possible:
+        return _OTHER_POSES
+    if _or_frame(check, change) == _OR_TOOL and not _is_near(move):
+        return _OTHER_TOOL
+    return _runnable(check, _KINDS[change.cause.kind][1])
 
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
@@ -198,11 +228,10 @@ def change_words(check: Check, change: PossibleChange) -> str:
     """A change with its estimates, as a part of a sentence."""
     found, robot = _estimates(check, change), check.calibration.calibrated_robot
     share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
-    is_camera = change.cause.kind == CAMERA
-    # All that stands before the robot moves alike in its base.
-    is_all = not _is_carried(check, is_camera) and (is_camera or len(check.prior.targets) < 2)
+    has_joints = any(other.cause.kind == JOINT for other in check.compared)
     facts = {
-        "or_base": ", or the robot's base was pushed" if is_all else "",
+        "or_frame": _or_frame(check, change),
+        "or_joint": "" if has_joints else _OR_JOINT,
         "name": change.name,
         "board": f"board {change.name.partition(' ')[2]}".strip(),
         "moved": _moved_words(found.get(CAMERA, found)),
@@ -226,6 +255,22 @@ def change_words(check: Check, change: PossibleChange) -> str:
             "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
         }
     return _KINDS[change.cause.kind][0].format(**facts)
+
+
+def _or_frame(check: Check, change: PossibleChange) -> str:
+    """The frame of the poses whose change looks the same as that of a camera or board."""
+    is_camera = change.cause.kind == CAMERA
+    # All that stands before the robot moves alike in its base, and all on its flange in that.
+    if change.cause.kind not in (CAMERA, BOARD) or not (is_camera or len(check.prior.targets) < 2):
+        return ""
+    if not _is_carried(check, is_camera):
+        return ", or the robot's base was pushed"
+    return _OR_TOOL if check.prior.model is None else ""
+
+
+def _is_near(move: Mapping[str, Any]) -> bool:
+    """Whether a mount that gives way may have moved so far."""
+    return bool(move["moved_mm"] < _LOOSE_MM and move["turned_deg"] < _LOOSE_DEG)
 
 
 def _load_words(check: Check) -> str:
@@ -344,17 +389,32 @@ def signed_axis(unit: FloatArray) -> str:
 
 
 def _agreement(check: Check) -> str:
-    turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
     # Nearly every check detects twice as many sigmas as a part of a motion is mentioned from.
     sure = 2.0 * CONTRADICTION * check.camera_sigma
-    off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     again = f" ({check.repeated} of them where the calibration's stood)" if check.repeated else ""
     verb = "agrees" if check.predicted.stops == 1 else "agree"
     return (
-        f"{_stops(check)}{again} {verb} with the calibration: off by {off_mm} mm and {off_deg} deg "
-        f"(rms); by chance alone it is more in {figure(100 * check.p_value)} % of checks. A camera "
+        f"{_stops(check)}{again} {verb} with the calibration: {_off(check)}. A camera "
         f"that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
         f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
+    )
+
+
+def _contradiction(check: Check) -> str:
+    verb = "contradicts" if check.predicted.stops == 1 else "contradict"
+    return (
+        f"{_stops(check)} {verb} the calibration, and no change that was looked for explains "
+        f"that: {_off(check)}."
+    )
+
+
+def _off(check: Check) -> str:
+    """How far the stops are off, and how often they are farther by chance."""
+    turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
+    return (
+        f"off by {off_mm} mm and {off_deg} deg (rms); by chance alone it is more in "
+        f"{figure(100 * check.p_value)} % of checks"
     )
 
 

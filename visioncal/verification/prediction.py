@@ -24,6 +24,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.kinds import COLUMN
 from visioncal.verification.calibration_prior import CalibrationPrior
+from visioncal.verification.misreading import misread_joints
 from visioncal.vision.corners import CornerStack, reproject
 from visioncal.vision.lens_field import depths_m
 from visioncal.vision.targets import numbered_positions, target_document
@@ -44,6 +45,7 @@ class PredictedStops:
     problem: Problem  # The m views of a board, with the calibration's unknowns.
     views: tuple[int, ...]  # (m,) their numbers.
     warnings: tuple[str, ...]  # Warnings, in sentences.
+    run: RunState  # The stages that observed them.
 
     @property
     def stops(self) -> int:
@@ -125,9 +127,9 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     run = replace(_STAGES["clock"](_STAGES["pnp"](run)), clocks={})
     # A joint's zero may be what changed; another reading of the angles is a mistake of the record.
     _STAGES["joints"](replace(run, level="hand-eye"))
-    observed = _with_poses(_with_arm(ObservedPoses.of(run), prior), prior)
+    observed = _with_poses(_with_arm(run, prior), prior)
     problem, warnings = observed.problem(observed.used), tuple(_warnings(observed, prior))
-    return PredictedStops(observed, problem, observed.used, warnings)
+    return PredictedStops(observed, problem, observed.used, warnings, run)
 
 
 def _in_lens_model(
@@ -150,24 +152,27 @@ def board_changes(problem: Problem, state: State) -> FloatArray:
     return changes
 
 
-def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
+def _with_arm(run: RunState, prior: CalibrationPrior) -> ObservedPoses:
     """Takes over the calibration's arm, with its errors as unknowns of known covariance.
 
     Raises:
         DataError: They are of joints that the session lacks.
     """
+    observed = ObservedPoses.of(run)
     observed = replace(observed, calibrated=replace(observed.robot_arm, model=prior.model))
     arm, session = observed.robot_arm, observed.session
     if prior.fit.arm is None:
         return observed
     if arm.joints_rad is None:
         missing = [view.number for view in session.views if view.joints_rad is None]
-        without = f"{counted(len(missing), 'view', ('has', 'have'))} no joint angles."
+        why = f"{counted(len(missing), 'view', ('has', 'have'))} no joint angles."
+        step = "Record q1_rad ... with every view."
+        if not missing and (found := misread_joints(run)) is not None:
+            why, step = f"those here do not belong to it. {found.words}", str(found.do or "")
         raise DataError(
-            f"session {session.name!r}: the calibration is of an arm by its joints, and "
-            + (without if missing else "its joints differ."),
+            f"session {session.name!r}: the calibration is of an arm by its joints, and {why}",
             culprits=[f"views.csv: view {index}" for index in missing],
-            next_step="Record q1_rad ... with every view.",
+            next_step=step,
         )
     errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
     return replace(observed, calibrated=replace(arm, errors=errors))
