@@ -26,6 +26,7 @@ from typing import Literal
 
 from visioncal.core.arguments import typed
 from visioncal.core.codec import read, write
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError, VisioncalError, check_names
 from visioncal.core.extras import client_library
 from visioncal.core.files import named_errors, natural, read_text, write_atomically
@@ -177,10 +178,10 @@ def failed_row(job: Job, error: str, words: str, next_step: str) -> Row:
 def kept_row(job: Job) -> Row | None:
     """The row of an earlier run with the same inputs; None where there is none."""
     try:
-        document = json.loads(read_text(job.folder / ROW))
+        document = parse_stored(read_text(job.folder / ROW), ROW)
         made_by = _made_by(job, _session(job))
-        row = read(Row, document["row"], "row")
-    except (VisioncalError, ValueError, TypeError, KeyError, RecursionError):
+        row = read(Row, document.get("row"), "row")
+    except VisioncalError:
         return None
     is_same = {key: document.get(key) for key in made_by} == made_by
     if not is_same or row.entry is None or not (job.folder / CALIBRATION).exists():

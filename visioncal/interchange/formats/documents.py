@@ -2,7 +2,6 @@
 
 import ast
 import re
-import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +18,7 @@ from visioncal.core.documents.structured import (
     rows_of_xml,
 )
 from visioncal.core.documents.tables import is_number
-from visioncal.core.documents.toml import check_values
+from visioncal.core.documents.toml import check_values, parse_toml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
@@ -121,8 +120,8 @@ def read_document(path: Path) -> object:
         return rows or _with_extrinsics(read_opencv(path))
     text = read_plain_text(path)
     if suffix == ".toml":
-        with suppress(tomllib.TOMLDecodeError):
-            return tomllib.loads(text)
+        with suppress(DataError):
+            return parse_toml(text, str(path))
     if suffix in (".toml", *KEYED):
         return keyed_record(text)
     parts = re.split(r"^---.*$", text, flags=re.MULTILINE)
