@@ -763,7 +763,7 @@ WRONG_PLACES = {
         "views.csv has rotations",
         "Name the touches first",
     ),
-    "no arm": (("simulate", "x", "--robot", "foo"), "generic-scara-600 are", "Name one"),
+    "no arm": (("simulate", "x", "--robot", "foo"), "the names are ur3e, ur5e", "Name one"),
     "readings to look in": (
         ("locate", "tracker", "-c", "tracked"),
         "is of an instrument",

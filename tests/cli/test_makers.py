@@ -199,8 +199,8 @@ def test_another_reading_of_the_rotations_takes_the_maker_away(cell, tmp_path):
 @pytest.mark.parametrize(
     ("form", "words"),
     [
-        ('"kuak"', ("robot.form is 'kuak'", ", ".join(POSE_FORMS), "Did you mean kuka?")),
-        ('"zzzzz"', ("robot.form is 'zzzzz'", ", ".join(POSE_FORMS))),
+        ('"kuak"', ("robot.form is 'kuak'", *map('"{}"'.format, POSE_FORMS), "Did you mean kuka?")),
+        ('"zzzzz"', ("robot.form is 'zzzzz'", *map('"{}"'.format, POSE_FORMS))),
         ("3", ("robot.form is 3",)),
     ],
 )
