@@ -279,8 +279,8 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
     damaged += [{**before, "state": {**state, "mean": state["mean"][:-1]}}]
     for document in damaged:
         raised(DataError, "cannot be used", guard.restore, document)
-    for wrong in ({"false_alarm_looks": 1.0}, {"slow_mm": -1.0}):
-        raised(DataError, "must be 100", Guard, place.calibration, **wrong)
+    for wrong, words in (({"false_alarm_looks": 1.0}, "100 to"), ({"slow_mm": -1.0}, "0 to 10")):
+        raised(DataError, f"must be a number from {words}", Guard, place.calibration, **wrong)
     without = replace(place.calibration, joint_fit=None)
     raised(DataError, "holds no fit", Guard, without)
 

@@ -81,11 +81,11 @@ def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a function or a clas
     # Return types may be imported for type checkers only.
     declared = {name: hint for name, hint in owner.__annotations__.items() if name != "return"}
     hints = typing.get_type_hints(
-        types.SimpleNamespace(__annotations__=declared), owner.__globals__
+        types.SimpleNamespace(__annotations__=declared), owner.__globals__, include_extras=True
     )
     for name, hint in list(hints.items()):
         if get_origin(hint) is typing.Unpack:
-            hints |= typing.get_type_hints(get_args(hints.pop(name))[0])
+            hints |= typing.get_type_hints(get_args(hints.pop(name))[0], include_extras=True)
     return hints
 
 

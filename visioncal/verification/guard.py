@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from visioncal.calibration.stages.corner_numbers import far_outside
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.core.arguments import check_fields, typed
+from visioncal.core.codec import within
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import invert, rigid_fault
@@ -122,8 +123,8 @@ class Guard:
         self,
         calibration: Calibration | Path | str,
         *,
-        false_alarm_looks: float = 10_000.0,
-        slow_mm: float = 0.05,
+        false_alarm_looks: Annotated[float, within(100.0, 1e9)] = 10_000.0,
+        slow_mm: Annotated[float, within(0.0, 10.0)] = 0.05,
         camera: str | None = None,
         robot: str | None = None,
         target: str | None = None,
@@ -140,17 +141,11 @@ class Guard:
             target: The target's name, likewise.
 
         Raises:
-            DataError: The calibration contains no covariance of its fit, or the choice is
-                ambiguous.
+            DataError: The calibration contains no covariance of its fit, the choice is ambiguous,
+                or a number is out of its range.
         """
         if not isinstance(calibration, Calibration):
             calibration = Calibration.load(calibration)
-        if not (100.0 <= false_alarm_looks < 1e9 and 0.0 <= slow_mm <= 10.0):
-            raise DataError(
-                f"guard: false_alarm_looks is {false_alarm_looks:g} and slow_mm {slow_mm:g}, but "
-                "must be 100 or more, and 0 to 10.",
-                culprits=["false_alarm_looks", "slow_mm"],
-            )
         self.prior = prior = CalibrationPrior.of(calibration.of(camera, robot, target))
         self._looks, self._is_changed = false_alarm_looks, False
         # The lens's errors that go with those of the frames, and what is left of them.
