@@ -1,6 +1,7 @@
 """Tools and fixtures from touches: the answer and its sigma, what is refused, and the commands."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -222,6 +223,26 @@ def test_a_part_of_another_size_is_reported_and_not_absorbed():
     centre = placed(frame.edge.matrix, np.mean(1e-3 * CAD_MM, axis=0)[None])
     meant = placed(FRAME, np.mean(1.002e-3 * CAD_MM, axis=0)[None])
     assert np.linalg.norm(centre - meant) < 2e-4
+
+
+def test_a_part_of_another_size_precedes_what_follows_of_it():
+    findings = drawn(1.004 * CAD_MM, NAMES).verdict.findings
+    assert findings[0].kind == "scale"
+    assert "--cad-unit" in findings[0].do.words
+
+
+def test_another_tool_than_stated_is_found_by_the_touches():
+    rng = np.random.default_rng(1)
+    rows = touch_rows(touching(1e-3 * CAD_MM, rng, NOISE_M), points=tuple(NAMES))
+    longer = made.FLANGE_FROM_TOOL @ compose(np.eye(3), np.array([0.0, 0.01, 0.05]))
+    other = replace(tool(), name="flange_from_other", edge=Edge(longer, np.zeros((6, 6))))
+    for stated, words in ((other, "with flange_from_other"), (None, "--tool none")):
+        cad = drawing(1e-3 * CAD_MM)
+        error = raised(DataError, "another tool touched", touched_fixture, rows, stated, cad)
+        assert words in str(error)
+        # Six points of 0.1 mm know it to some tenths.
+        found = re.search(r"a tip at \(([-\d., ]*)\) mm", str(error))
+        assert np.fromstring(found[1], sep=",") == pytest.approx(1e3 * TOOL_TIP, abs=0.5)
 
 
 def test_a_plane_has_a_hand_by_the_side_that_it_was_touched_from():
@@ -525,6 +546,37 @@ def test_poses_of_a_tool_that_was_active_are_doubted(tmp_path):
     tool = found(tcp(tmp_path, replace(made.touches, base_from_flange=of_tip), "--json"))
     assert tool["verdict"]["status"] == "check"
     assert "active in the controller" in tool["verdict"]["reasons"][0]
+
+
+def test_some_poses_of_a_tool_that_was_active_are_left_out(tmp_path):
+    made = touched(Job(axes=2), 1)
+    poses, rows = made.touches.base_from_flange.copy(), [1, 4, 6]
+    poses[rows, :3, 3] += poses[rows, :3, :3] @ TIP
+    tool = found(tcp(tmp_path, replace(made.touches, base_from_flange=poses), "--json"))
+    assert off_mm(tool) < NEAR_MM
+    assert [at["name"] for at in tool["observations"] if not at["used"]] == ["2", "5", "7"]
+    assert "moment or tool" in tool["verdict"]["reasons"][0]
+
+
+def test_touches_of_axes_hide_no_mistake_of_the_tips(tmp_path):
+    made = touched(Job(axes=2), 1)
+    inverse = replace(made.touches, base_from_flange=invert(made.touches.base_from_flange))
+    tcp(tmp_path, inverse).refused("poses read the other way round", "--robot-inverse")
+    # Every other touch with the tip is of a point of its own.
+    poses = made.touches.base_from_flange.copy()
+    poses[1 : made.touches.kinds.count("point") : 2, :3, 3] += [0.05, 0.03, 0.02]
+    tcp(tmp_path, replace(made.touches, base_from_flange=poses)).refused(
+        "agree on a point of their own", "column point"
+    )
+
+
+def test_a_touch_with_the_name_of_another_point_is_left_out(tmp_path):
+    made = touched(Job(tips=4, points=2, axes=2), 2)
+    points = made.touches.points.copy()
+    points[2] = 1 - points[2]
+    tool = found(tcp(tmp_path, replace(made.touches, points=points), "--json"))
+    assert off_mm(tool) < NEAR_MM
+    assert [at["name"] for at in tool["observations"] if not at["used"]] == ["3"]
 
 
 def test_several_points_need_fewer_touches_of_each(tmp_path):

@@ -16,6 +16,7 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
 from visioncal.estimation.observability import Direction
 from visioncal.frames.group_outliers import GroupInliers
+from visioncal.frames.other_tip import with_other_tip
 from visioncal.frames.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of
 from visioncal.frames.pointfit import (
     FEATURE_KINDS,
@@ -31,15 +32,23 @@ from visioncal.frames.touches import (
     NominalPoints,
     Tool,
     TouchRows,
+    flange_poses,
     robot_noise,
     touched_points,
 )
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
 
-_TOUCH_AGAIN = (
+_NAME_AGAIN = (
     "Correct the names of what is named; where they are right, touch it once more, and write the "
     "new poses in its rows."
+)
+_TOUCH_AGAIN = (
+    "Touch what is named once more, and write the new poses in its rows; where it is another point "
+    "or kind than its row states, correct that."
+)
+_OTHER_DRAWING = (
+    "Look at the drawing's issue, scale and unit (--cad-unit), and measure a length of the part."
 )
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
@@ -141,6 +150,11 @@ class PointsFit:
                 words.append("" if inliers.mask[at] else f"{off}: {cause}")
         return words
 
+    @property
+    def again(self) -> str:
+        """Advice on a touch that is wrong: those of a drawing have names alone."""
+        return _TOUCH_AGAIN if any(self.kinds) else _NAME_AGAIN
+
     def findings(self, setting: FitSettings) -> Iterator[Finding]:
         """Findings on the fit, led by the touch without which the others agree, if it is one."""
         found = [*self._doubts(setting)]
@@ -153,7 +167,7 @@ class PointsFit:
                 f"agree to {figure(1e3 * level_m)} mm per axis, and with it to "
                 f"{figure(1e3 * self.agreement.fit.sigma)} mm: too little to leave it out."
             )
-            yield Finding("suspected", words, Remedy(_TOUCH_AGAIN, AGAIN))
+            yield Finding("suspected", words, Remedy(self.again, AGAIN))
         yield from found
 
     def _doubts(self, setting: FitSettings) -> Iterator[Finding]:
@@ -165,11 +179,11 @@ class PointsFit:
         ]
         for at in np.flatnonzero(~self.agrees).tolist():
             words = f"{names[at]} was left out: {reasons[at]}."
-            yield Finding("left_out", words, Remedy(_TOUCH_AGAIN, AGAIN))
+            yield Finding("left_out", words, Remedy(self.again, AGAIN))
         if self.agreement.doubtful.any():
             some = some_of([names[at] for at in np.flatnonzero(self.agreement.doubtful).tolist()])
             words = f"{some} contradict each other, and which is wrong is not known: all are used."
-            yield Finding("contradicting", words, Remedy(_TOUCH_AGAIN))
+            yield Finding("contradicting", words, Remedy(self.again))
         noise_mm, (check, bad) = 1e3 * self.noise_m, setting.options.noise_mm
         if noise_mm > check:
             yield Finding(
@@ -302,7 +316,14 @@ def touched_fixture(
     setting = FitSettings(touch_noise_m, doubts, details, options or FixtureLimits())
     if drawing is None:
         return _feature_fixture(measured, rows.kinds, setting)
-    return drawn_fixture(measured, drawing, setting)
+    try:
+        return drawn_fixture(measured, drawing, setting)
+    except DataError as error:
+        beside = drawing.beside(measured.names, measured.points, measured.scattered)
+        poses = rows.base_from_flange
+        if tool is not None:
+            poses = flange_poses(rows, robot, calibration)
+        raise with_other_tip(error, beside, poses, tool) from error
 
 
 def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: FitSettings) -> Frame:
@@ -404,6 +425,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
     used = len({name for name, ok in zip(pairs.labels, fitted.agrees, strict=True) if ok})
     share = "" if used == count else f"{used} of "
     deviation, more = abs(fit.scale.value - 1.0), list[Finding]()
+    first = [*named]
     if fit.scale.differs:
         # The frame does not absorb scale.
         extent_m = float(np.linalg.norm(np.ptp(pairs.nominal, axis=0)))
@@ -418,7 +440,12 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
             f"{fit.scale.sigma:.5f}), {figure(1e3 * deviation * extent_m)} mm over its "
             f"{figure(1e3 * extent_m)} mm, which the frame does not take in: {cause}"
         )
-        more.append(Finding("scale", words, is_fatal=deviation > _WARM * 10))
+        # Another drawing explains the noise and weak directions that follow.
+        if deviation < _WARM:
+            more.append(Finding("scale", words))
+        else:
+            is_fatal, do = deviation > 10 * _WARM, Remedy(_OTHER_DRAWING)
+            first.append(Finding("scale", words, do, is_fatal=is_fatal))
     if fit.is_flat and not named:
         normal = spreads(pairs.nominal[fitted.agrees])[1][2]
         cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
@@ -451,7 +478,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
             **_worst_details(fitted),
         },
         setting,
-        named,
+        first,
     )
 
 

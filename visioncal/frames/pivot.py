@@ -13,6 +13,7 @@ Outlier touches are left out (see `group_outliers`) and named.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, TypeAlias
@@ -27,7 +28,7 @@ from visioncal.core.robust import small_sets
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, apply_each, compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.observability import Direction, Turning
+from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction, Turning
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
@@ -93,14 +94,23 @@ class PivotFit:
 
     @property
     def looks_inverse(self) -> bool:
-        """Whether the poses may be `flange_from_base`, which exchanges the tip and the one point.
+        """Whether the poses may be `flange_from_base`; see `looks_inverse`."""
+        return looks_inverse(self.agreement.fit.state)
 
-        Touches of one point close either way; the poses look inverse where the tip is farther from
-        the flange than the point is from the base.
-        """
-        points = self.agreement.fit.state.points
-        tip_m, point_m = np.linalg.norm([self.flange_from_tool[:3, 3], points[0]], axis=1)
-        return bool(len(points) == 1 and tip_m > point_m)
+
+def looks_inverse(state: Placement) -> bool:
+    """Whether poses may be `flange_from_base`, which exchanges the tip and the one point.
+
+    Touches of one point close either way; the poses look inverse where the tip is farther from the
+    flange than the point is from the base.
+    """
+    tip_m, point_m = np.linalg.norm([state.frame[:3, 3], state.points[0]], axis=1)
+    return bool(len(state.points) == 1 and tip_m > point_m)
+
+
+def tip_start(touches: Touches) -> Placement:
+    """The tip and its points by all touches of kind `point`, by linear least squares."""
+    return _start(touches, np.flatnonzero(touches.are("point")), oriented=False)
 
 
 def tool_problem(touches: Touches, noise: Noise = _NO_NOISE, *, oriented: bool) -> PointProblem:
@@ -144,12 +154,12 @@ def tips_and_points(
 
 
 def two_points(touches: Touches) -> Touches | None:
-    """The touches of one point as of two, where they agree best; None of too few touches.
+    """Touches of one point with the tip as of two, where they agree best; None of too few.
 
     Three touches of one point determine a tip, whose places by all touches lie at two points.
     """
     # Five of two points would leave the choice of two touches among five few redundant coordinates.
-    if len(touches) < 6 or len(touches.names) > 1 or not touches.are("point").all():
+    if len(touches) < 6 or len(touches.names) > 1:
         return None
     splits = list[Touches]()
     for rows in small_sets(len(touches), FEWEST_POINTS):
@@ -225,9 +235,12 @@ def fit_pivot(
             start = (presumed, _turned(touches, inliers.fit.state))
             inliers = find_inlier_groups(problem, expected_sigma_m, start)
 
-            def refitted(kinds: tuple[TouchKind, ...]) -> GroupFit:
+            def refitted(kinds: tuple[TouchKind, ...]) -> GroupFit | None:
                 of_kinds = replace(touches, kinds=kinds)
-                return fit_groups(tool_problem(of_kinds, noise, oriented=True))
+                with suppress(DataError):
+                    _check_counts(of_kinds)
+                    return fit_groups(tool_problem(of_kinds, noise, oriented=True))
+                return None
 
             refuse_exchanged_kinds("tcp", touches.labels, touches.kinds, refitted)
         fit, edge = inliers.fit, 6 if problem.oriented else 3
@@ -297,6 +310,13 @@ def _check_counts(touches: Touches) -> None:
 
 def _cause(touches: Touches, fit: GroupFit, culprit: Direction) -> tuple[str, str]:
     """Why touches leave a direction undetermined, in words, and what to do."""
+    if culprit.is_rotation and fit.sigma > SIGMA_LIMIT_M:
+        return (
+            f"the touches disagree by {figure(1e3 * fit.sigma)} mm per axis, as where poses are "
+            "misread, or of another tool or moment in some rows, or several points were touched",
+            "State the form of the poses (--robot-form, --robot-inverse), take all with the "
+            "controller's tool at zero, and name the points in a column point.",
+        )
     if culprit.is_rotation:
         return (
             "the touches of kind z or xz have their points too near to the tip",

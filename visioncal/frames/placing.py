@@ -19,8 +19,8 @@ from visioncal.estimation.points import GroupFit
 LEAST_NOISE_M = 1e-6
 # A careful touch by hand [m]: the noise where nothing determines it.
 TOUCH_NOISE_M = 1e-4
-# Noise beyond which touches may be of other kinds [m].
-_DISAGREE_M = 1e-3
+# Noise beyond which touches may be of other kinds, or by another tool [m].
+DISAGREE_M = 1e-3
 # Touches at most of which any two are tried with each other's kinds.
 _MOST_TRIED = 24
 _Kind = TypeVar("_Kind", bound=str)
@@ -84,7 +84,7 @@ def refuse_exchanged_kinds(
     label: str,
     names: Sequence[str],
     kinds: tuple[_Kind, ...],
-    fitted: Callable[[tuple[_Kind, ...]], GroupFit],
+    fitted: Callable[[tuple[_Kind, ...]], GroupFit | None],
 ) -> None:
     """Refuses touches that agree with other kinds, and do not with theirs.
 
@@ -92,12 +92,12 @@ def refuse_exchanged_kinds(
         label: The first word of the message.
         names: (n,) names of the touches.
         kinds: (n,) their kinds.
-        fitted: The fit of all touches, of (n,) kinds.
+        fitted: The fit of all touches, of (n,) kinds; None of kinds that determine no frame.
     """
-    declared_m = fitted(kinds).sigma
-    if declared_m < _DISAGREE_M:
+    declared = fitted(kinds)
+    if declared is None or declared.sigma < DISAGREE_M:
         return
-    tried = list[tuple[GroupFit, str, Sequence[str]]]()
+    tried = list[tuple[GroupFit | None, str, Sequence[str]]]()
     # Of many touches each two take too long, and none stands for all.
     some = range(len(kinds) if len(kinds) <= _MOST_TRIED else 0)
     for a, b in combinations(some, 2):
@@ -111,15 +111,18 @@ def refuse_exchanged_kinds(
         wrong = some_of([f"{a} is {b}" for a, b in renamed.items() if a != b])
         fit = fitted(tuple(renamed[kind] for kind in kinds))
         tried.append((fit, f"the touches ({wrong})", ()))
-    tried = [one for one in tried if one[0].freedom > 1]
-    agree_m = min((fit.sigma for fit, _, _ in tried), default=np.inf)
-    if CLEAR_RATIO * agree_m < declared_m:
-        rivals = [one for one in tried if one[0].sigma < CLEAR_RATIO * agree_m]
+    found = [
+        (fit.sigma, words, at) for fit, words, at in tried if fit is not None and fit.freedom > 1
+    ]
+    agree_m = min((sigma_m for sigma_m, _, _ in found), default=np.inf)
+    # Kinds by which touches disagree, too, explain nothing.
+    if agree_m < DISAGREE_M and CLEAR_RATIO * agree_m < declared.sigma:
+        rivals = [(words, at) for sigma_m, words, at in found if sigma_m < CLEAR_RATIO * agree_m]
         raise DataError(
-            f"{label}: {some_of([words for _, words, _ in rivals])} have each other's kinds: "
+            f"{label}: {some_of([words for words, _ in rivals])} have each other's kinds: "
             f"corrected, all agree to {figure(1e3 * agree_m)} mm per axis, and to "
-            f"{figure(1e3 * declared_m)} mm as they are.",
-            culprits=rivals[0][2],
+            f"{figure(1e3 * declared.sigma)} mm as they are.",
+            culprits=rivals[0][1],
             next_step="Look what was touched, and correct the column kind.",
         )
 

@@ -14,13 +14,16 @@ from visioncal.core.limits import CLEAR_RATIO, WIDE_RAD, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
+from visioncal.estimation.points import FEWEST_POINTS
 from visioncal.frames.fixture import FitSettings, PointsFit
 from visioncal.frames.pivot import (
     PivotFit,
     Touches,
     TouchKind,
     fit_pivot,
+    looks_inverse,
     scatter_m,
+    tip_start,
     tips_and_points,
     two_points,
 )
@@ -32,6 +35,12 @@ from visioncal.robot import Robot
 TOUCH_KINDS = ("point", "z", "xz")
 # Distance within which touches are of one point, over the noise of a touch per axis.
 _NEAR = 6.0
+_INVERSE = Finding(
+    "inverse_poses",
+    "The tip would be farther from the flange than the point from the base: poses read the other "
+    "way round look like this.",
+    Remedy("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
+)
 
 
 @typed
@@ -75,9 +84,15 @@ def touched_tool(
     limit_m = 1e-3 * options.noise_mm[0]
     try:
         fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
-    except DegenerateError as error:
+    except (DataError, DegenerateError) as error:
+        if rows.kinds.count("point") < FEWEST_POINTS:
+            raise
         other = _other_reading(touches, rows.numbers, limit_m)
         other = other or next(_two_points(touches, rows.places, limit_m), None)
+        # Touches of axes disagree then, and not those of the tip.
+        is_sound = scatter_m(touches) < limit_m
+        if other is None and is_sound and looks_inverse(tip_start(touches)):
+            other = _INVERSE
         if other is None or other.do is None:
             raise
         command = other.do.command.removeprefix(AGAIN).strip()
@@ -91,7 +106,7 @@ def touched_tool(
         rows.kinds,
         Edge(fit.flange_from_tool, fit.covariance),
         fit.agreement,
-        ["the tip had slipped, it is of another point, or the pose is of another moment"]
+        ["the tip had slipped, it is of another point, or the pose is of another moment or tool"]
         * len(touches),
         fit.agreement.fit.sigma,
         fit.worst,
@@ -186,6 +201,8 @@ def _other_points(fit: PivotFit, touches: Touches, places: Sequence[str]) -> Ite
 
 def _two_points(touches: Touches, places: Sequence[str], limit_m: float) -> Iterator[Finding]:
     """The finding that touches agree as of two points, of which a consensus finds neither."""
+    tips = touches.are("point")
+    touches, places = touches.subset(tips), [places[row] for row in np.flatnonzero(tips).tolist()]
     declared_m, split = scatter_m(touches), two_points(touches)
     if split is not None and max(limit_m, CLEAR_RATIO * scatter_m(split)) < declared_m:
         chosen = np.flatnonzero(split.points != split.points[0]).tolist()
@@ -210,12 +227,7 @@ def _other_point(
 def _findings(fit: PivotFit, touches: Touches, setting: FitSettings) -> Iterator[Finding]:
     """Findings on what the poses are of, and on too few touches."""
     if fit.looks_inverse:
-        yield Finding(
-            "inverse_poses",
-            "The tip would be farther from the flange than the point from the base: poses read the "
-            "other way round look like this.",
-            Remedy("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
-        )
+        yield _INVERSE
     tip_m = float(np.linalg.norm(fit.flange_from_tool[:3, 3]))
     # A tip nearer to the poses' origin than any tool is long: the poses are a tool's already [m].
     if tip_m < 2e-3:

@@ -44,7 +44,7 @@ from visioncal.vision.targets import corner_positions
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 # Changes of a smaller probability are not listed.
 _LISTED_SHARE = 1e-3
-# A mount that gives way farther hangs; another tool of the controller is farther away.
+# A mount that gives way farther hangs, and another tool of the controller is mostly farther away.
 _LOOSE_MM, _LOOSE_DEG = 20.0, 5.0
 _OR_TOOL = ", or another tool was active in the controller"
 _OR_JOINT = ", or a joint slipped, as rows with joint angles (q1_rad ...) would show"
@@ -195,7 +195,7 @@ def _step(check: Check, change: PossibleChange) -> Remedy:
     # No camera or board moves farther, and no arm grows so; poses in another unit seem to.
     if move.get("moved_mm", 0.0) > 5e3 or not change.is_possible:
         return _OTHER_POSES
-    if _or_frame(check, change) == _OR_TOOL and not _is_near(move):
+    if _or_frame(check, change, move) == _OR_TOOL:
         return _OTHER_TOOL
     return _runnable(check, _KINDS[change.cause.kind][1])
 
@@ -230,7 +230,7 @@ def change_words(check: Check, change: PossibleChange) -> str:
     share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
     has_joints = any(other.cause.kind == JOINT for other in check.compared)
     facts = {
-        "or_frame": _or_frame(check, change),
+        "or_frame": _or_frame(check, change, found),
         "or_joint": "" if has_joints else _OR_JOINT,
         "name": change.name,
         "board": f"board {change.name.partition(' ')[2]}".strip(),
@@ -257,7 +257,7 @@ def change_words(check: Check, change: PossibleChange) -> str:
     return _KINDS[change.cause.kind][0].format(**facts)
 
 
-def _or_frame(check: Check, change: PossibleChange) -> str:
+def _or_frame(check: Check, change: PossibleChange, move: Mapping[str, Any]) -> str:
     """The frame of the poses whose change looks the same as that of a camera or board."""
     is_camera = change.cause.kind == CAMERA
     # All that stands before the robot moves alike in its base, and all on its flange in that.
@@ -265,12 +265,9 @@ def _or_frame(check: Check, change: PossibleChange) -> str:
         return ""
     if not _is_carried(check, is_camera):
         return ", or the robot's base was pushed"
-    return _OR_TOOL if check.prior.model is None else ""
-
-
-def _is_near(move: Mapping[str, Any]) -> bool:
-    """Whether a mount that gives way may have moved so far."""
-    return bool(move["moved_mm"] < _LOOSE_MM and move["turned_deg"] < _LOOSE_DEG)
+    # Where the arm was calibrated, joint angles say where the flange is.
+    is_far = move["moved_mm"] > _LOOSE_MM or move["turned_deg"] > _LOOSE_DEG
+    return _OR_TOOL if is_far and check.prior.model is None else ""
 
 
 def _load_words(check: Check) -> str:
