@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Unpack
 
 from visioncal.calibration.pipeline.assessment import assess_fit
 from visioncal.calibration.pipeline.explaining import explained
-from visioncal.calibration.pipeline.judging import check_answer, judge_run
+from visioncal.calibration.pipeline.judging import check_answer, judge_run, judged_beside
 from visioncal.calibration.pipeline.reading import (
     check_joint_angles,
     put_on_one_clock,
@@ -21,6 +22,7 @@ from visioncal.calibration.stages.board_points import with_board_points
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.suspects.misread_poses import misreadings, with_open_chains
+from visioncal.calibration.suspects.pairs_alone import found_alone, is_open, pairs_alone
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import VisioncalError
@@ -181,6 +183,21 @@ def _examine(state: RunState) -> RunState:
     return state.noting(Rejection(view.view, view.reason) for view in rejected)
 
 
+def _judge(state: RunState) -> RunState:
+    """Judges the result; of a whole cell whose causes are open, also by what its pairs show."""
+    state = judge_run(state)
+    if not is_open(state):
+        return state
+    return judged_beside(state, [*found_alone(state, pairs_alone(state, partial(_of_pair, state)))])
+
+
+def _of_pair(state: RunState, session: Session, corners: Mapping[int, Corners]) -> RunState:
+    """The run of one robot, camera and target of a cell, of corners that were detected."""
+    alone = initial_state(session, level=state.level, threads=state.threads or None)
+    seen = corners if session.corner_table is None else None
+    return run_stages(replace(alone, given_corners=seen))
+
+
 STAGES: tuple[Stage, ...] = (
     Stage("robot", read_cell_inputs),
     Stage("detect", lambda state: detect_targets(state, state.given_corners)),
@@ -192,13 +209,21 @@ STAGES: tuple[Stage, ...] = (
     Stage("joints", check_joint_angles),
     Stage("solve", _fit),
     Stage("examine", _examine),
-    Stage("judge", judge_run),
+    Stage("judge", _judge),
 )
 
 
 def misread_poses(state: RunState) -> Iterator[Finding]:
     """Findings on other readings of a run's poses that explain what its camera sees."""
     yield from misreadings(state)
+
+
+def _explained_by_pairs(error: VisioncalError, state: RunState) -> VisioncalError:
+    """The error of a whole cell with the first cause that a pair of it shows alone."""
+    every = [] if state.mount is not None else pairs_alone(state, partial(_of_pair, state))
+    for found in found_alone(state, every):
+        return type(error)(found.words, next_step=str(found.do or ""))
+    return error
 
 
 def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
@@ -212,6 +237,8 @@ def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
                 state = stage.run(state)
             except VisioncalError as error:
                 likely = explained(error, state, stage.name, are_located=are_located)
+                if likely.message == error.message and stage.name in ("solve", "examine"):
+                    likely = _explained_by_pairs(error, state)
                 if likely is error:
                     raise
                 raise likely from error

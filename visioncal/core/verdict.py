@@ -37,7 +37,6 @@ GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 # Options of `convert` that change all robots or cameras.
-_OF_ONE = re.compile(r"--(?:by-joints|intrinsics)\b")
 _BY_HAND = "Of several robots or cameras, correct the files by hand."
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
@@ -59,15 +58,13 @@ class Remedy:
         is_shown = self.command and AGAIN not in self.command
         return f"{self.words} Run: {self.command}" if is_shown else self.words
 
-    @property
-    def of_cell(self) -> "Remedy":
-        """The remedy for several robots or cameras: by hand where its command takes one of each."""
-        if not _OF_ONE.search(self.command):
-            return self
-        by_hand = _BY_HAND
-        if "--intrinsics" in self.command:
+    def of_cell(self, robots: int, cameras: int) -> "Remedy":
+        """The remedy for some robots and cameras: by hand where its command is for all of many."""
+        if "--intrinsics" in self.command and cameras > 1:
             by_hand = 'Of several cameras, write intrinsics = "refine" in the table of this one.'
-        return Remedy(f"{self.words} {by_hand}")
+            return Remedy(f"{self.words} {by_hand}")
+        is_of_all = "--by-joints" in self.command and robots > 1
+        return Remedy(f"{self.words} {_BY_HAND}") if is_of_all else self
 
 
 def look_at(view: int) -> str:
@@ -146,10 +143,11 @@ class Finding:
         return self.words if self.do is None else f"{self.words} {self.do}"
 
 
-def of_cell(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings with remedies for a session of several robots or cameras."""
+def of_cell(findings: Iterable[Finding], robots: int, cameras: int) -> tuple[Finding, ...]:
+    """Findings with remedies for a session of some robots and cameras."""
     return tuple(
-        found if found.do is None else replace(found, do=found.do.of_cell) for found in findings
+        found if found.do is None else replace(found, do=found.do.of_cell(robots, cameras))
+        for found in findings
     )
 
 

@@ -92,7 +92,7 @@ def read_cell(
         tree,
         arms,
         {frame_name("camera", name): table for name, table in session.cameras.items()},
-        {frame_name("target", name): plate for name, plate in session.plates.items()},
+        {session.board_frames[name]: board for name, board in session.boards.items()},
         tuple(sightings),
         Moments.of(arms, even_progress(len(stations)), rates, stamps_s),
         tuple(sweeps),

@@ -23,7 +23,7 @@ from visioncal.estimation.unknowns import EDGE
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.information import RecordedStops
 from visioncal.robot.files import robot_names
-from visioncal.session import Session, frame_name
+from visioncal.session import Session
 from visioncal.vision.targets import extent_m, first_corners
 
 # Lower bound of a robot's noise; few stops may show less by chance [rad and m].
@@ -99,7 +99,7 @@ def start_from_session(
     elif arm.joints_rad is not None:
         robot = ArmModel.of(robot, arm.joints_rad, arm.poses).robot
     _, board, *_ = fit.frames
-    planned = [frame_name("target", name) for name in run.session.boards].index(board)
+    planned = [*run.session.board_frames.values()].index(board)
     free = free_parameters_of_camera(fit.linearised)
     cell = PlanCell(
         run.session.mount,

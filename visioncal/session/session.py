@@ -478,6 +478,12 @@ class Session:
             return self.targets
         return {"": self.target}
 
+    @cached_property
+    def board_frames(self) -> Mapping[str, str]:
+        """Frames of the printed targets, by their names in `boards`."""
+        pairs = zip(self.boards, self.plates, strict=True)
+        return {name: frame_name("target", plate) for name, plate in pairs}
+
     def board_of(self, view: View) -> str:
         """Name in `boards` of the target that a view shows."""
         return view.text.get(COLUMN, "").strip() if self.targets else ""

@@ -17,7 +17,7 @@ from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.solve import solve_without
 from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE
 from visioncal.results.sections import UncertaintyResult
-from visioncal.session import Session, frame_name
+from visioncal.session import Session
 from visioncal.vision.targets import corner_positions
 
 # Sources of a single pair that are not clocks.
@@ -114,9 +114,10 @@ def uncertainty_of(cell_fit: CellFit, fit: Fit) -> UncertaintyResult:
 
 def middles_of(cell: Cell) -> dict[str, FloatArray]:
     """(3,) middle of each printed target in its frame [m], by frame."""
+    session = cell.session
     return {
-        frame_name("target", name): corner_positions(plate).mean(axis=0)
-        for name, plate in cell.session.plates.items()
+        session.board_frames[name]: corner_positions(board).mean(axis=0)
+        for name, board in session.boards.items()
     }
 
 
@@ -153,9 +154,9 @@ def _sources(cell_fit: CellFit, fit: Fit) -> Sources:
 def middle_jacobians(fit: Fit, session: Session) -> dict[str, FloatArray]:
     """(3, b) Jacobians of targets' middles by the columns of all boards [m], by frame."""
     jacobians = {}
-    for (plate, target), name in zip(session.plates.items(), session.boards, strict=True):
+    for name, target in session.boards.items():
         values = fit.unknowns.values_of((BOARD, name))
         jacobian = np.zeros((3, len(fit.whole)))
         jacobian[:, fit.unknowns[BOARD, name]] = shape_basis(target).mean(axis=0)[:, values]
-        jacobians[frame_name("target", plate)] = jacobian[:, fit.unknowns.of_kinds(BOARD, SIZE)]
+        jacobians[session.board_frames[name]] = jacobian[:, fit.unknowns.of_kinds(BOARD, SIZE)]
     return jacobians

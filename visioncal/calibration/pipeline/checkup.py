@@ -75,8 +75,8 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
         run, error = _run_stages(run)
         run = with_undone(run) if error is None else run
         findings = [*_findings(run, error)]
-    if error is None and run.mount is None:
-        findings = [*of_cell(findings)]
+    if error is None:
+        findings = [*of_cell(findings, len(run.robots), len(run.cameras))]
     if not isinstance(session, Session):
         for at, finding in enumerate(findings):
             if (do := finding.do) is not None:

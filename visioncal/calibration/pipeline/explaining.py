@@ -31,7 +31,7 @@ def explained(
         return error
     state = with_misreading(state)
     read = state.misread or ()
-    for misread in read if is_pair else of_cell(read):
+    for misread in of_cell(read, len(state.robots), len(state.cameras)):
         # Directions that are undetermined with misread poses mean nothing.
         return type(error)(misread.words, next_step=str(misread.do))
     if isinstance(error, DegenerateError) and (words := _open_chain(state)):

@@ -54,8 +54,30 @@ def judge_run(state: RunState) -> RunState:
             findings = replace(findings, warnings=(*state.misread, *rest))
             verdict = judge(findings)
     if state.mount is None:
-        verdict = replace(verdict, findings=of_cell(verdict.findings))
+        verdict = replace(
+            verdict, findings=of_cell(verdict.findings, len(state.robots), len(state.cameras))
+        )
     warnings = tuple(findings.warnings)
+    return replace(state, warnings=warnings, findings=findings, verdict=verdict)
+
+
+def judged_beside(state: RunState, found: Sequence[Finding]) -> RunState:
+    """The verdict with causes that pairs of a whole cell show by themselves."""
+    if not found or state.findings is None:
+        return state
+    findings, views = state.findings, {view for each in found for view in each.views}
+    pairs = [
+        replace(pair, outliers=[out for out in pair.outliers if out.view not in views])
+        for pair in findings.pairs
+    ]
+    # Of a robot's tool, all that it carries seems to have moved.
+    effects = ("moved_frame",) if any(each.kind == "something_moved" for each in found) else ()
+    warnings = (*found, *(at for at in findings.warnings if at.kind not in effects))
+    findings = replace(findings, pairs=pairs, warnings=warnings)
+    verdict = judge(findings)
+    verdict = replace(
+        verdict, findings=of_cell(verdict.findings, len(state.robots), len(state.cameras))
+    )
     return replace(state, warnings=warnings, findings=findings, verdict=verdict)
 
 

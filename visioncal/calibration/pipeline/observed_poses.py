@@ -16,7 +16,6 @@ from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT
-from visioncal.session import frame_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +98,7 @@ class ObservedPoses(Observed):
         """The frame of one of the session's boards."""
         if len(self.session.boards) < 2:
             return edge_names(self.session.mount)[1].partition("_from_")[2]
-        return frame_name("target", tuple(self.session.boards)[board])
+        return [*self.session.board_frames.values()][board]
 
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""

@@ -206,7 +206,7 @@ def _joint_fit(run: RunState) -> JointFit | None:
         return None
     boards, fit = run.session.boards, run.assessment.fit
     names = [
-        board for board in boards if len(boards) < 2 or frame_name("target", board) in fit.frames
+        name for name, at in run.session.board_frames.items() if len(boards) < 2 or at in fit.frames
     ]
     covariance, by_noise = _fit_covariance(run)
     looks, first = list[int](), 0
@@ -422,7 +422,7 @@ def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]
         values, free = fit.values(board), fit.unknowns.values_of(board)
         sigmas = np.zeros(len(values))
         sigmas[free] = fit.sigmas(board)
-        if frame_name("target", plate) not in fit.problem.tree.branches:
+        if run.session.board_frames[plate] not in fit.problem.tree.branches:
             continue
         if not target.is_rig:
             # Where single corners are elsewhere, that board is not to be used again.

@@ -24,7 +24,6 @@ from visioncal.estimation.problem_parts import Observations, State
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.solve import CellFit, solve_from
 from visioncal.model.effects import Play
-from visioncal.session import frame_name
 
 # Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
@@ -184,8 +183,8 @@ def _ambiguous(
 
 def targets_of(cell: Cell) -> dict[str, Target]:
     """The printed targets by their frames."""
-    plates = cell.session.plates
-    return {frame_name("target", name): plate for name, plate in plates.items()}
+    session = cell.session
+    return {session.board_frames[name]: board for name, board in session.boards.items()}
 
 
 def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:

@@ -14,9 +14,9 @@ from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.results import HELD_BACK
-from visioncal.session import Observation, Session, frame_name
+from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.document import PriorTable
-from visioncal.session.kinds import is_camera_observation
+from visioncal.session.kinds import has_robot_state, is_camera_observation, name_of
 from visioncal.session.selecting import is_whole_cell
 
 _CELL = "cell"
@@ -60,6 +60,18 @@ class Cell:
     def views_from(self, station: int) -> list[int]:
         """The views from a station on."""
         return [row.view for row in (*self.rows, *self.held) if row.station >= station]
+
+    def rows_of_robot(self, robot: str, stop: int) -> list[int]:
+        """The views with a robot's poses from a stop of the session on."""
+        own = (
+            view
+            for name in self.session.robots
+            if robot_key(name) == robot
+            for view in rows_of_robot(self.session, name)
+        )
+        return [
+            view.number for view in own if (view.number if view.stop is None else view.stop) >= stop
+        ]
 
     def or_separately(self, do: str, station: int, note: str = "") -> Remedy:
         """Advice to `do` something and record again, or to calibrate what follows it alone.
@@ -189,6 +201,16 @@ def pair_edges(session: Session) -> tuple[str, ...]:
     boards = tuple(session.targets) or ("",)
     parent = target.partition("_from_")[0]
     return (camera, *(f"{parent}_from_{frame_name('target', board)}" for board in boards))
+
+
+def rows_of_robot(session: Session, robot: str) -> list[View]:
+    """The rows with the state of a robot, by its name in a session."""
+    declaration = session.declaration
+    return [
+        view
+        for view in session.views
+        if has_robot_state(view) and name_of(declaration, "robot", view) == robot
+    ]
 
 
 def robot_key(name: str) -> str:

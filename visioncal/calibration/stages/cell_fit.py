@@ -24,7 +24,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
 from visioncal.estimation.unknowns import BOARD
-from visioncal.session import frame_name
 from visioncal.vision.targets import corner_positions
 
 # An arm without joint angles may look like a step of a frame.
@@ -170,7 +169,7 @@ class CellFit:
             stated.parts[BOARD, name].start + SCALE: sizes.scales[frame]
             for scene in scenes.values()
             for name in scene.printed
-            if (frame := frame_name("target", name)) in sizes.scales
+            if (frame := self.cell.session.board_frames[name]) in sizes.scales
             and not sizes.boards.get(name, BoardSizes()).is_held
         }
         return stated.with_values(np.array([*starts], dtype=np.int64), np.array([*starts.values()]))

@@ -145,7 +145,7 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
     holds = is_confounded or all(one.board_odds < np.log(3.0) for one in solved.doubts)
     boards = dict[str, BoardSizes]()
     for name, target in session.boards.items():
-        key: Key = ("shape", frame_name("target", name))
+        key: Key = ("shape", session.board_frames[name])
         if key in fit.unknowns:
             scale, plane, bend = (_size(fit, f"{of} {key[1]}") for of in ("scale", "plane", "bend"))
             stated = target.square_sigma_m / target.square_m

@@ -26,7 +26,6 @@ from visioncal.estimation.joint import (
     size_of_measured,
 )
 from visioncal.estimation.unknowns import BOARD, LENS
-from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
 from visioncal.vision.targets import corner_positions
 
@@ -53,7 +52,8 @@ def _found(run: RunState) -> Iterator[Finding]:
         for arm in cell_fit.arms.values():
             stated = arm.without_errors(stated)
     for name, target in run.session.boards.items():
-        called, frame, board = f"board {name}".strip(), frame_name("target", name), (BOARD, name)
+        called, frame = f"board {name}".strip(), run.session.board_frames[name]
+        board = BOARD, name
         measured = measured_scale(cell_fit, fitted, frame, name, target)
         if target.is_rig:
             if stated is not None:

@@ -1,6 +1,5 @@
 """Findings on misread poses: another reading of them explains what the cameras see."""
 
-import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -32,6 +31,7 @@ from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.moved_views import IN_MOTION
 from visioncal.calibration.suspects.other_rows import of_other_rows
+from visioncal.calibration.suspects.pairs_alone import of_all_rows
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
@@ -50,7 +50,6 @@ from visioncal.core.verdict import (
 )
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
-from visioncal.session.kinds import has_robot_state, name_of
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -92,8 +91,6 @@ _REAL_PART = Remedy(
 )
 # A number that stands still does so to a digit; others vary by more [mm, deg].
 _DIGIT_MM, _DIGIT_DEG, _VARIES_MM, _VARIES_DEG = 1e-3, 2e-3, 20.0, 5.0
-# Views whose poses an option changes.
-_ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):")
 # Shares of the way to another stop that are tried.
 _SHARES = np.linspace(-0.4, 0.4, 81).round(2)
 UNRECORDED = Remedy(
@@ -153,36 +150,11 @@ def with_undone(run: RunState) -> RunState:
                 others = [at.number for at in run.session.views if at.number not in found.views]
                 do = or_alone(do.words, others)
             else:
-                do = _of_all_rows(found, run, robot)
+                do = of_all_rows(found, run, robot)
             found = replace(found, words=f"{whose}: {found.words}", do=do)
             run = undone(run, replace(mistake, found=found))
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
-
-
-def _of_all_rows(found: Finding, run: RunState, robot: str) -> Remedy | None:
-    """A finding's remedy whose command changes all rows of a robot at the stops of its views.
-
-    Between two rows that are shifted all are, whether or not they are of the same pair.
-    """
-    do, rows = found.do, run.session.views
-    named = None if do is None else _ON_VIEWS.search(do.command)
-    if do is None or named is None:
-        return do
-    stops = {at.stop for at in rows if at.number in found.views}
-    of_robot = [
-        at
-        for at in rows
-        if has_robot_state(at) and name_of(run.session.declaration, "robot", at) == robot
-    ]
-    ends = [at for at, view in enumerate(of_robot) if view.stop in stops]
-    if not ends:
-        return Remedy(do.words)
-    if named[1] == "shift":
-        stops = {at.stop for at in of_robot[ends[0] : ends[-1] + 1]}
-    start, end = named.span(2)
-    every = ranges([at.number for at in of_robot if at.stop in stops])
-    return replace(do, command=f"{do.command[:start]}{every}{do.command[end:]}")
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:
@@ -210,7 +182,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
                 seen = " and ".join(filter(None, [pair.camera, pair.target]))
                 within = f", in its rows of {seen}"
             words = f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}"
-            yield replace(hint, words=words, do=_of_all_rows(hint, run, robot))
+            yield replace(hint, words=words, do=of_all_rows(hint, run, robot))
             # All of these would show the same.
             break
 

@@ -1,13 +1,15 @@
 """Frames of a whole cell that moved during the session, at once or all the time."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from visioncal.calibration.stages.cell_fit import CellFit
+from visioncal.calibration.suspects.moved_views import is_switched, other_frame, tool_taken_off
 from visioncal.core.number_format import figure, mm_and_deg, some_of
-from visioncal.core.transforms import exp, pose_difference
+from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.moves import creep_effects
@@ -20,14 +22,22 @@ from visioncal.session.frames import object_name
 _EXCHANGED = 0.05
 
 
-def moved_findings(moves: Sequence[Moved], edges: Mapping[str, Edge]) -> Iterator[Finding]:
-    """Findings on frames that moved, by the transforms of the result; exchanged cameras first."""
+def moved_findings(
+    moves: Sequence[Moved], edges: Mapping[str, Edge], cell_fit: CellFit | None = None
+) -> Iterator[Finding]:
+    """Findings on frames that moved, by the transforms of the result; exchanged cameras first.
+
+    By the fit, those that a flange carries may have moved since the controller's tool was switched.
+    """
     exchanged = set[int]()
     for one, other in combinations(range(len(moves)), 2):
         if (found := _exchanged(moves, one, other, edges)) is not None:
             exchanged |= {one, other}
             yield found
-    yield from (_moved(move) for at, move in enumerate(moves) if at not in exchanged)
+    for at, move in enumerate(moves):
+        if at not in exchanged:
+            switched = None if cell_fit is None else _of_tool(move, moves, edges, cell_fit)
+            yield switched or _moved(move)
 
 
 def _exchanged(
@@ -74,6 +84,32 @@ def _moved(moved: Moved) -> Finding:
         f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
         Remedy(f"Fasten {moved.frame}, and record again."),
     )
+
+
+def _of_tool(
+    moved: Moved, moves: Sequence[Moved], edges: Mapping[str, Edge], cell_fit: CellFit
+) -> Finding | None:
+    """The finding that a tool was switched, where all that a flange carries moved with a frame."""
+    tree, frame = cell_fit.cell.tree, moved.frame
+    flange = tree.branches[frame].parent
+    before, after = edges[moved.before].matrix, edges[frame].matrix
+    if flange not in tree.flanges.values() or not is_switched(invert(before) @ after):
+        return None
+    carried = {name for name, at in tree.branches.items() if at.parent == flange}
+    if carried - {one.frame for one in moves if one.first_stop == moved.first_stop}:
+        return None
+    robot = next(name for name, at in tree.flanges.items() if at == flange)
+    views = cell_fit.cell.rows_of_robot(robot, moved.first_stop)
+    plain = _moved(moved)
+    otherwise = f"fasten {frame}, and record again."
+    do = tool_taken_off(cell_fit, frame, (before, after), views, otherwise)
+    if do is None:
+        return None
+    words = (
+        f"{plain.words} Or the controller's tool is another one from stop {moved.first_stop} on, "
+    )
+    words += f"by {other_frame(before, after)}, as everything on {flange} moved."
+    return replace(plain, words=words, do=do)
 
 
 def crept_findings(cell_fit: CellFit) -> Iterator[Finding]:

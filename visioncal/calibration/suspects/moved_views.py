@@ -25,7 +25,7 @@ _ONE_END = 1e-3
 # An industrial arm errs by so much at most [mm, deg].
 _ARM_ERRS = CalibrationLimits.arm_errors
 # A knock moves what is fastened by less [mm, deg].
-_KNOCKED = 20.0, 5.0
+KNOCKED = 20.0, 5.0
 # Of views before or after a frame of the controller was switched.
 OF_OTHER_FRAMES = ": their result is for the tool and the base frame that were active there"
 # Another size turns nothing, and a small marker's noise less than so [rad].
@@ -268,11 +268,13 @@ def tool_taken_off(
         views: The views.
         otherwise: What to do where no tool was active.
     """
-    on_camera = "cam" if cell_fit.cell.mount == "eye-in-hand" else "target"
+    tree = cell_fit.cell.tree
+    robot = next(
+        (name for name, at in tree.flanges.items() if tree.branches[frame].parent == at), None
+    )
     # Joint angles that belong to the poses rule a tool out.
-    has_joints = any(arm.matched is not None for arm in cell_fit.arms.values())
-    mount = cell_fit.cell.mount
-    if has_joints or not frame.startswith(on_camera) or mount in (None, "instrument"):
+    is_ruled_out = robot is None or cell_fit.arms[robot].is_modelled
+    if is_ruled_out or cell_fit.cell.mount == "instrument":
         return None
     tool = edges[0] @ invert(edges[1])
     twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
@@ -287,13 +289,13 @@ def is_switched(step: FloatArray) -> bool:
 
     A knock moves what is fastened by millimetres.
     """
-    return bool(np.greater(pose_difference(np.eye(4), step), _KNOCKED).any())
+    return bool(np.greater(pose_difference(np.eye(4), step), KNOCKED).any())
 
 
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
     """The frame that moved from some view on, and by how much, in words."""
     if not frame:
-        known = any(arm.matched is not None for arm in cell_fit.arms.values())
+        known = any(arm.is_modelled for arm in cell_fit.arms.values())
         joint = ", or the zero of a joint," if known else ""
         moved = mm_and_deg(*pose_difference(np.eye(4), step))
         how = f": by about {moved}" if np.any(step != np.eye(4)) else ""

@@ -17,7 +17,7 @@ from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Remedy, mending
 from visioncal.results import Moved
 from visioncal.robot import Robot
-from visioncal.session.frames import frame_name, object_name
+from visioncal.session.frames import object_name
 from visioncal.vision.targets import rotation_transforms
 
 # Kinds of findings, which others name.
@@ -85,9 +85,10 @@ def explained_outliers(
     outliers, agreed = np.flatnonzero(~cell_fit.inlier_fit.used), cell_fit.inlier_fit
     if not len(outliers):
         return (), {}, frozenset()
+    session = cell_fit.cell.session
     turns = {
-        frame_name("target", name): rotation_transforms(target)
-        for name, target in cell_fit.cell.session.boards.items()
+        session.board_frames[name]: rotation_transforms(target)
+        for name, target in session.boards.items()
     }
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
     circles = exchanged(agreed.problem, fitting)

@@ -16,6 +16,7 @@ from visioncal.calibration.suspects import (
     mirrored_cell,
     misread_poses,
     mounting,
+    pairs_alone,
     rounded_poses,
     steps,
     turned_views,
@@ -42,7 +43,7 @@ def _outliers(run: RunState) -> Iterator[Finding]:
     for fault in run.assessment.faults:
         yield replace(fault.found, without_it=without(fault.found.views, held_out.words))
     if run.mount is None:
-        yield from moved_findings(run.assessment.moved, run.assessment.edges)
+        yield from moved_findings(run.assessment.moved, run.assessment.edges, run.cell_fit)
         yield from crept_findings(run.cell_fit)
 
 
@@ -75,6 +76,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("something_moved", chance=1e-4),
     Suspect("moved_frame", chance=1e-4),
     Suspect("frame_creeps", chance=1e-4),
+    pairs_alone.PAIRS_APART,
     Suspect("wrong_views", chance=1e-3),
     Suspect("holdout", chance=1e-3),
     # Arms, steps, lenses and boards.

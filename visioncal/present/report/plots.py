@@ -311,7 +311,7 @@ def placements(
         row, pose = rows.get(seen.view), seen.cam_from_target
         if seen.view not in used or row is None or row.joints_rad is None or pose is None:
             continue
-        named = frame_name("target", session.board_of(row) if session.targets else "")
+        named = session.board_frames.get(session.board_of(row), "")
         target = cell.in_cell(named if named in placed else placed[0], seen.view)
         eye = cell.in_cell(sensor, seen.view)
         if target is not None and eye is not None:

@@ -1,0 +1,158 @@
+"""Two cameras at one robot: faults that a single pair shows are named, and their commands mend."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.edited import Rows, edit_rows
+from support.following import follow
+from support.refusals import raised
+
+import visioncal
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import invert, log
+from visioncal.results import Calibration
+from visioncal.session.columns import POSE
+from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, RobotAt, cell_session, simulate
+from visioncal.simulation.layout import CELL
+
+# Chi-square of six exceeds this in one case of a thousand.
+MOST = 22.5
+MIDWAY = 12
+AXIS_M = np.random.default_rng(5).uniform(-0.3, 0.3, 24)
+
+
+def stereo(folder: Path, *, in_hand: bool = True, scale: float = 1.0, stops: int = 24):
+    """Two cameras on a flange and a board before them, or a board in hand before two cameras.
+
+    The table has no joint angles, as most recordings.
+    """
+    on, board_on = ("a", CELL) if in_hand else (CELL, "a")
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),),
+        cameras=(
+            CameraAt("left", on, place_m=(0.0, -1.0, 1.1)),
+            CameraAt("right", on, place_m=(0.0, 1.0, 1.2)),
+        ),
+        boards=(BoardAt("board", board_on, place_m=(0.0, 0.0, 0.05), scale=scale),),
+        stops=stops,
+        seed=1,
+    )
+    cell = simulate(options)
+    cell_session(cell, "cell", seen="corners").save(folder)
+
+    def without_joints(rows: Rows) -> Rows:
+        return [{name: row[name] for name in row if not name.endswith("_rad")} for row in rows]
+
+    edit_rows(folder, without_joints)
+    return cell
+
+
+def with_tool(folder: Path, is_active):
+    """Poses of some stops are those of a tool's tip, at (10, 20, 150) mm and turned by 30 deg."""
+
+    def change(rows: Rows) -> Rows:
+        for row in rows:
+            if is_active(int(row["stop"])):
+                numbers = np.array([float(row[name]) for name in POSE])
+                turn = Rotation.from_quat(numbers[3:])
+                place = numbers[:3] + turn.apply([0.01, 0.02, 0.15])
+                turn = turn * Rotation.from_euler("z", 30.0, degrees=True)
+                both = [*place.tolist(), *turn.as_quat().tolist()]
+                row |= dict(zip(POSE, map(repr, both), strict=True))
+        return rows
+
+    edit_rows(folder, change)
+
+
+def turned(folder: Path, camera: str):
+    """All corners of a camera are numbered from the other end of the board."""
+    with (folder / "views.csv").open(encoding="utf-8") as file:
+        views = {row["view"] for row in csv.DictReader(file) if row["camera"] == camera}
+    path = folder / "corners.csv"
+    with path.open(encoding="utf-8") as file:
+        rows = [*csv.DictReader(file)]
+    last = max(int(row["point"]) for row in rows)
+    for row in rows:
+        if row["view"] in views:
+            row["point"] = str(last - int(row["point"]))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*rows[0]])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def on_a_rail(rows: Rows) -> Rows:
+    """Positions without a rail along x, which has a column of its own."""
+    for row in rows:
+        along = float(AXIS_M[int(row["stop"])])
+        row |= {"x_m": repr(float(row["x_m"]) - along), "rail_m": repr(along)}
+    return rows
+
+
+def mended(cell) -> Calibration:
+    """The good result to which printed commands lead; cameras in hand are within its sigmas."""
+    followed = follow("calibrate", "cell", "-o", "out")
+    words = [*followed.words]
+    found = Calibration.load(words[words.index("-o") + 1])
+    assert found.verdict.status == "good", followed.last.said
+    assert all(view.used for view in found.views)
+    for name, edge in found.edges.items():
+        parent, _, frame = name.partition("_from_")
+        if parent == "flange_a":
+            away = log(invert(cell.mountings[frame]) @ edge.matrix)
+            assert away @ np.linalg.solve(edge.covariance, away) < MOST
+    return found
+
+
+@pytest.mark.parametrize("is_active", [lambda stop: stop >= MIDWAY, lambda stop: stop % 4 == 1])
+def test_a_tool_that_was_active_at_some_stops_moves_all_cameras(tmp_path, monkeypatch, is_active):
+    monkeypatch.chdir(tmp_path)
+    cell = stereo(tmp_path / "cell")
+    with_tool(tmp_path / "cell", is_active)
+    cause = visioncal.calibrate("cell").verdict.causes[0]
+    assert cause.kind == "something_moved"
+    assert "and alike of cam_" in cause.words
+    assert "--without-tool" in cause.do.command
+    mended(cell)
+
+
+def test_a_board_in_hand_moves_with_the_tool_that_was_switched(tmp_path, monkeypatch):
+    """With ten views each, no camera shows it alone."""
+    monkeypatch.chdir(tmp_path)
+    cell = stereo(tmp_path / "cell", in_hand=False, stops=20)
+    with_tool(tmp_path / "cell", lambda stop: stop >= MIDWAY)
+    cause = visioncal.calibrate("cell").verdict.causes[0]
+    assert (
+        "the controller's tool is another one from stop 12 on, by (10, 20, 150) mm" in cause.words
+    )
+    mended(cell)
+
+
+def test_corners_of_one_camera_that_are_numbered_from_the_other_end(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cell = stereo(tmp_path / "cell")
+    turned(tmp_path / "cell", "right")
+    words = "cam_.* numbers the corners of target_board from the other end"
+    raised(DegenerateError, words, visioncal.calibrate, "cell")
+    mended(cell)
+
+
+def test_a_rail_with_a_column_is_added_to_all_rows_of_its_robot(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cell = stereo(tmp_path / "cell")
+    edit_rows(tmp_path / "cell", on_a_rail)
+    cause = visioncal.calibrate("cell").verdict.causes[0]
+    assert "lack a motion along x" in cause.words
+    assert ":x+1*rail_m,y,z" in cause.do.command
+    mended(cell)
+
+
+def test_the_only_board_of_two_cameras_has_a_size(tmp_path):
+    stereo(tmp_path / "cell", scale=0.95)
+    found = visioncal.calibrate(tmp_path / "cell")
+    assert [cause.kind for cause in found.verdict.causes[:1]] == ["board_size"]
+    # By the robot's motion; its sigma is below a tenth of a percent.
+    assert found.boards["board"].shape["scale"] == pytest.approx(-0.05, abs=1e-3)

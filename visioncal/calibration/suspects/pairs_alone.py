@@ -1,0 +1,229 @@
+"""Causes that show where each robot, camera and target of a whole cell is calibrated alone.
+
+A cell takes the pictures of another lens, or a tool that was switched, for views that are wrong or
+frames that moved. Where pairs agree by themselves, and not with each other, that is named.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.guess.recording import FEWEST_ROWS
+from visioncal.calibration.pipeline.guess_inputs import of_pair
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.cell import rows_of_robot
+from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.moved_views import KNOCKED
+from visioncal.calibration.suspects.suspect import UNEXPLAINED, Suspect
+from visioncal.core.errors import VisioncalError
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import mm_and_deg, ranges, robot_words, some_of
+from visioncal.core.transforms import invert, log, pose_difference
+from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.core.verdict import Finding, Remedy, mending, or_alone
+from visioncal.estimation.unknowns import EDGE
+from visioncal.session import Session
+from visioncal.session.frames import object_name
+from visioncal.vision.targets import corner_positions
+
+PairRun = Callable[[Session, Mapping[int, Corners]], RunState]
+
+# Of a cell of many, the pairs of most views are calibrated.
+_MOST_PAIRS = 8
+# Kinds of a cell's first cause behind which a pair may show more: no cause, or effects of one.
+_OPEN = ("", UNEXPLAINED, "wrong_views", "lost_views", "moved_frame")
+# Kinds of causes that a cell's own fit does not find. Those of a robot are in all of its pairs.
+_OF_ROBOT, _OF_CAMERA = ("something_moved", "late_poses"), ("other_lens", "image_sizes", "lens")
+# Frames by two pairs that are further apart than so many sigmas, and than an arm errs, are others.
+_SIGMAS = 6.0
+# Views whose poses or images an option changes.
+_ON_VIEWS = re.compile(r"--(shift|positions|without-tool) ([\d,-]+):")
+
+
+@dataclass(frozen=True, eq=False)
+class PairAlone:
+    """A robot, a camera and a target of a cell, calibrated by themselves."""
+
+    robot: str  # Name of the robot in the session.
+    pair: CameraTargetPair  # The camera, the target and their views.
+    answer: RunState  # The finished run.
+
+    @property
+    def words(self) -> str:
+        """Camera and target in a sentence."""
+        return f"{self.pair.camera} and {self.pair.target}"
+
+    @property
+    def frames(self) -> dict[str, FloatArray]:
+        """(4, 4) camera and target in what carries them, by the cell's names."""
+        camera, target = [*self.answer.assessment.fit.frames.values()][:2]
+        return {self.pair.camera: camera, self.pair.target: target}
+
+    def covariance(self, frame: str) -> FloatArray:
+        """(6, 6) covariance of the camera's or the target's frame."""
+        names = [*self.answer.assessment.fit.frames][:2]
+        return self.answer.assessment.fit.covariance((EDGE, names[frame == self.pair.target]))
+
+
+def is_open(run: RunState) -> bool:
+    """Whether a cell's verdict leaves open what a pair of it may show alone."""
+    verdict = run.verdict
+    if run.mount is not None or verdict is None or verdict.status == "good":
+        return False
+    kind = next((cause.kind for cause in verdict.causes), "")
+    moves = ((move.shift_mm, move.turn_deg) for move in run.assessment.moved)
+    is_knock = kind == "moved_frame" and not any(np.greater(by, KNOCKED).any() for by in moves)
+    return kind in _OPEN and not is_knock
+
+
+def pairs_alone(run: RunState, calibrated: PairRun) -> list[PairAlone]:
+    """The pairs of a cell that give a result by themselves, those of most views first."""
+    every = [
+        (robot, pair)
+        for robot in run.session.robots
+        for pair in pairs_of(run, robot)
+        if len(pair.poses) >= FEWEST_ROWS
+    ]
+    every.sort(key=lambda item: -len(item[1].poses))
+    found = list[PairAlone]()
+    for robot, pair in every[:_MOST_PAIRS] if len(every) > 1 else ():
+        alone = of_pair(run, robot, pair)
+        corners = {
+            view: seen for look in alone.cameras.values() for view, seen in look.corners.items()
+        }
+        try:
+            answer = calibrated(alone.session, corners)
+        except VisioncalError:
+            # Another pair may show why.
+            continue
+        found.append(PairAlone(robot, pair, answer))
+    return found
+
+
+def found_alone(run: RunState, every: Sequence[PairAlone]) -> Iterator[Finding]:
+    """Causes that pairs show by themselves, and where two of them contradict each other."""
+    for robot in run.session.robots:
+        of_robot = [one for one in every if one.robot == robot]
+        causes = dict[str, list[tuple[PairAlone, Finding]]]()
+        for one in of_robot:
+            verdict = one.answer.verdict
+            for cause in () if verdict is None else verdict.causes[:2]:
+                causes.setdefault(cause.kind, []).append((one, cause))
+        for kind in _OF_ROBOT:
+            # Of one camera alone, the camera itself was moved, as the cell's own fit says.
+            if kind in causes and len(causes[kind]) == len(of_robot):
+                yield _of_robot(run, robot, causes[kind])
+        for kind in _OF_CAMERA:
+            for one, cause in causes.get(kind, ()):
+                yield cause.of("" if len(run.session.cameras) < 2 else one.pair.camera)
+        yield from _contradictions(run, of_robot)
+
+
+def _of_robot(run: RunState, robot: str, found: Sequence[tuple[PairAlone, Finding]]) -> Finding:
+    """A cause that all pairs of a robot show, with the views of all."""
+    cause, views = found[0][1], sorted({view for _, each in found for view in each.views})
+    whose = robot_words(robot)
+    words = f"{whose[0].upper()}{whose[1:]}, in its rows of {found[0][0].words}"
+    if len(found) > 1:
+        words += f", and alike of {some_of([one.words for one, _ in found[1:]])}"
+    cause = replace(cause, words=f"{words}: {cause.words}", views=tuple(views))
+    return replace(cause, do=of_all_rows(cause, run, robot), probability=0.0)
+
+
+def of_all_rows(found: Finding, run: RunState, robot: str) -> Remedy | None:
+    """A finding's remedy whose command changes all rows of a robot at the stops of its views.
+
+    Between two rows that are shifted all are, whether or not they are of the same pair.
+    """
+    do, rows = found.do, run.session.views
+    named = None if do is None else _ON_VIEWS.search(do.command)
+    if do is None or named is None:
+        return do
+    stops = {at.stop for at in rows if not found.views or at.number in found.views}
+    of_robot = rows_of_robot(run.session, robot)
+    ends = [at for at, view in enumerate(of_robot) if view.stop in stops]
+    if not ends:
+        return Remedy(do.words)
+    if named[1] == "shift":
+        stops = {at.stop for at in of_robot[ends[0] : ends[-1] + 1]}
+    start, end = named.span(2)
+    every = ranges([at.number for at in of_robot if at.stop in stops])
+    return replace(do, command=f"{do.command[:start]}{every}{do.command[end:]}")
+
+
+def _contradictions(run: RunState, every: Sequence[PairAlone]) -> Iterator[Finding]:
+    """Frames that two pairs of one robot place otherwise, each pair's with its nearest rival's."""
+    sound = [one for one in every if _agrees(one)]
+    for at, other in enumerate(sound):
+        for one in sound[:at]:
+            for frame in one.frames.keys() & other.frames.keys():
+                step = invert(one.frames[frame]) @ other.frames[frame]
+                covariance = one.covariance(frame) + other.covariance(frame)
+                twist = log(step)
+                is_clear = twist @ np.linalg.solve(covariance, twist) > _SIGMAS**2
+                if is_clear and np.greater(_apart(step), CalibrationLimits.arm_errors).any():
+                    yield _contradiction(run, one, other, frame, step)
+                    return
+
+
+def _apart(step: FloatArray) -> tuple[float, float]:
+    mm, deg = pose_difference(np.eye(4), step)
+    return float(mm), float(deg)
+
+
+def _agrees(one: PairAlone) -> bool:
+    """Whether most views of a pair agree by themselves."""
+    verdict = one.answer.verdict
+    return verdict is not None and verdict.status != "bad"
+
+
+def _contradiction(
+    run: RunState, one: PairAlone, other: PairAlone, frame: str, step: FloatArray
+) -> Finding:
+    """The finding that two pairs agree by themselves, and place a frame otherwise."""
+    views = tuple(sorted(other.pair.poses))
+    both = f"{one.words} agree by themselves, and so do {other.words}"
+    board = (
+        run.session.plates.get(object_name(frame, "target")) if frame == one.pair.target else None
+    )
+    middle = None if board is None else _half_turn(board, step)
+    if middle is not None:
+        x, y = (f"{1e3 * value:.2f}".rstrip("0").rstrip(".") for value in middle)
+        words = (
+            f"{other.pair.camera} numbers the corners of {frame} from the other end, turned by 180 "
+            f"deg in its plane, than {one.pair.camera}: {both}."
+        )
+        do = mending("they are numbered alike", f"--turned {ranges(views)}:180,{x},{y}")
+        return Finding(PAIRS_APART.kind, words, do, views)
+    others = [
+        view
+        for pair in pairs_of(run, one.robot)
+        if pair.camera == other.pair.camera
+        for view in pair.poses
+    ]
+    moved = "it was moved" if board is not None else "the board was another one"
+    words = (
+        f"{both}, but place {frame} {mm_and_deg(*_apart(step))} apart: between their views, "
+        f"{moved}, or the rows of one have another lens, board or robot than is stated."
+    )
+    do = or_alone(
+        "Look at one picture of each, and record both with one setup; or calibrate the rows of one "
+        "camera alone.",
+        sorted(others),
+    )
+    return Finding(PAIRS_APART.kind, words, do, views)
+
+
+def _half_turn(board: Target, step: FloatArray) -> tuple[float, float] | None:
+    """Middle (2,) [m] about which a board is turned by 180 deg in its plane by a step, if it is."""
+    corners = corner_positions(board)
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turn[:2, 3] = 2.0 * middle[:2]
+    is_turned = np.less(_apart(invert(turn) @ step), CalibrationLimits.arm_errors).all()
+    return (float(middle[0]), float(middle[1])) if is_turned else None
+
+
+PAIRS_APART = Suspect("pairs_apart", None, 1e-6, of_chain=True, hides=("wrong_views", UNEXPLAINED))
