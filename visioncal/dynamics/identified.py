@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.codec import KEPT, Key, Vector, read, reading, write
-from visioncal.core.documents.jsons import parse_stored
+from visioncal.core.documents.jsons import check_schema, parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
 from visioncal.core.limits import DynamicsLimits
@@ -377,12 +377,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         DataError: It is of another schema.
         LookupError, TypeError, ValueError, AttributeError: It does not match the schema.
     """
-    if document.get("schema") != SCHEMA:
-        raise DataError(
-            f"schema is {document.get('schema')!r}, this version reads {SCHEMA}.",
-            culprits=["schema"],
-            next_step="Write one with visioncal dynamics identify.",
-        )
+    check_schema(document, SCHEMA, "Write one with visioncal dynamics identify.")
     robot = Robot.from_document(document["robot"])
     terms = FrictionTerms(**document["friction"])
     model = DynamicModel(robot, terms)

@@ -42,7 +42,7 @@ class Selection(Choice):
     # An existing document, all else of which is kept.
     onto: str | None = option(
         "For oak: the device's own calibration, as depthai saves it.",
-        metavar="PATH",
+        metavar="<path>",
         parse=text_in,
     )
     convention: str | None = option("Of robot-dh's table.", metavar="|".join(get_args(Convention)))

@@ -12,10 +12,9 @@ import numpy as np
 from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.codec import Key, Vector, read, reading, write
 from visioncal.core.conventions import PoseForm
-from visioncal.core.documents.jsons import parse_stored
+from visioncal.core.documents.jsons import check_schema, parse_stored
 from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.documents.tables import csv_text
-from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line, read_text, sha256
 from visioncal.core.types import FloatArray
@@ -186,7 +185,7 @@ def read_plan(path: Path | str) -> PlanFile:
     file = path / _FILE if path.is_dir() else path
     document = parse_stored(read_text(file), str(file))
     with reading(str(file), "a plan", "Make one with visioncal plan -o FOLDER."):
-        DocumentTable(document, str(file)).integer("schema", _SCHEMA, _SCHEMA)
+        check_schema(document, _SCHEMA, "Make one with visioncal plan -o FOLDER.")
         request = document["request"]
         start = {"start_q": request["start_q"]} if "start_q" in request else {}
         plan = read(PlanFile, document | start, "")

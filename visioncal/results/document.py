@@ -14,6 +14,7 @@ from visioncal.core.codec import (
     read_fields,
     write,
 )
+from visioncal.core.documents.jsons import check_schema
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.types import Mount
@@ -31,7 +32,6 @@ from visioncal.results.parts import (
     SessionForm,
     SolverResult,
     StoredVerdict,
-    check_schema,
 )
 from visioncal.results.sections import BoardResult, CalibrationSections, RigResult
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
@@ -140,7 +140,7 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
 
 def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a calibration, read from a document of `to_document`; raises DataError."""
-    check_schema(document)
+    check_schema(document, SCHEMA, "Calibrate the session again.")
     form: CalibrationForm | CellForm
     if "tree" in document:
         form = read(CellForm, document, "")

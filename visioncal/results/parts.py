@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.choices import PoseForm
 from visioncal.core.codec import DROPPED, INLINE, REST, WrittenForm
 from visioncal.core.conventions import controller_form
-from visioncal.core.errors import DataError
 from visioncal.core.types import Need
 from visioncal.core.verdict import Finding, Verdict, VerdictStatus
 from visioncal.results.arm import ArmSections
@@ -22,18 +21,6 @@ SCHEMA: Literal[2] = 2
 _ROBOT_FORM = WrittenForm(
     lambda item: dict(item.document), lambda item, _: Robot.from_document(item) if item else None
 )
-
-
-def check_schema(document: Mapping[str, Any]) -> None:
-    """Checks that a result is of the schema that this version reads; raises DataError."""
-    schema = document.get("schema")
-    if schema != SCHEMA:
-        is_newer = isinstance(schema, int) and schema > SCHEMA
-        raise DataError(
-            f"schema is {schema!r}, this version reads {SCHEMA}.",
-            culprits=["schema"],
-            next_step="A newer visioncal reads it." if is_newer else "Calibrate the session again.",
-        )
 
 
 @dataclass(frozen=True)

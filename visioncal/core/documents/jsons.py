@@ -195,3 +195,18 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise type_error(document, "a table", label)
     return document
+
+
+def check_schema(document: Mapping[str, Any], known: int, next_step: str) -> None:
+    """Checks that a stored document is of the schema that this version reads; raises DataError.
+
+    `next_step` is the remedy for an older one.
+    """
+    schema = document.get("schema")
+    if schema != known:
+        is_newer = isinstance(schema, int) and schema > known
+        raise DataError(
+            f"schema is {schema!r}, this version reads {known}.",
+            culprits=["schema"],
+            next_step="A newer visioncal reads it." if is_newer else next_step,
+        )
