@@ -31,6 +31,7 @@ from visioncal.cli.dynamics_options import (
 from visioncal.cli.plan import boxes_of, floor_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict
+from visioncal.core.codec import wrong_value
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.limits import DynamicsLimits
@@ -74,10 +75,8 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     if options.tool is not None:
         length, radius = (1e-3 * number for number in options.tool)
         if min(length, radius) <= 0.0:
-            raise DataError(
-                f"--tool is {options.tool}, but must be a length and a radius above zero [mm].",
-                culprits=["--tool"],
-            )
+            needed = "a length and a radius above zero [mm]"
+            raise wrong_value(options.tool, needed, "--tool")
         flange = arm.chain.placements[-1]
         tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
         bodies.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
@@ -169,11 +168,8 @@ def dynamics_record_command(options: DynamicsRecordOptions) -> None:
     """Runs `visioncal dynamics record`."""
     kind, _, host = options.arm.partition(":")
     if kind != "ur" or not host:
-        raise DataError(
-            f"--arm is {options.arm!r}, but must be ur:HOST, as ur:192.168.0.10.",
-            culprits=["--arm"],
-            next_step="Other arms' recordings go into streams/NAME.csv of a session.",
-        )
+        step = "Other arms' recordings go into streams/NAME.csv of a session."
+        raise wrong_value(options.arm, "ur:HOST, as ur:192.168.0.10", "--arm", step)
     path = options.out / STREAMS / f"{options.stream}.csv"
     check_free(path, force=False, replaceable=False)
     with signals_as_interrupts(), closing(UrArm(host, watch_only=True, full_rate=True)) as arm:

@@ -13,6 +13,7 @@ from visioncal.cli.console import answer, print_json, report_written, say, warn
 from visioncal.cli.plan_source import Kept, Source, chosen_part, find_source, pose_of, robot_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import MOST_FOR_NEED, ClearanceOptions, PlanOptions
+from visioncal.core.codec import wrong_value
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
@@ -221,12 +222,9 @@ def boxes_of(kept: ClearanceOptions) -> tuple[Box, ...]:
     for words in kept.boxes or ():
         parts = words.split(":")
         if len(parts) != 3 or not parts[0].strip():
-            raise DataError(
-                f"--box is {words[:80]!r}, but must be NAME:X,Y,Z:SX,SY,SZ, with the centre in the "
-                "base and the lengths in mm.",
-                culprits=["--box"],
-                next_step="Such as --box name:500,0,300:400,400,400",
-            )
+            needed = "NAME:X,Y,Z:SX,SY,SZ, with the centre in the base and the lengths in mm"
+            step = "Such as --box name:500,0,300:400,400,400"
+            raise wrong_value(words, needed, "--box", step)
         centre_m = 1e-3 * np.array(numbers_in(parts[1], "--box", "x,y,z"))
         size_m = 1e-3 * np.array(numbers_in(parts[2], "--box", "sx,sy,sz"))
         boxes.append(Box(parts[0].strip(), compose(np.eye(3), centre_m), size_m))

@@ -265,7 +265,7 @@ def read_value(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what 
         return read_value(_fitting(_alternatives(kind), value), value, path)
     if origin is Literal:
         if not any(value == each for each in args if type(value) is type(each)):
-            raise type_error(value, needed_of(kind), path, _similar(value, args))
+            raise wrong_value(value, needed_of(kind), path, _similar(value, args))
         return value
     if origin is tuple:
         return _read_tuple(kind, value, path)
@@ -292,13 +292,13 @@ def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see
     checked = read_value(inner, value, path)
     for mark in marks:
         if isinstance(mark, Check) and not mark.fits(checked):
-            raise type_error(value, mark.needed, path, _similar(value, mark.names))
+            raise wrong_value(value, mark.needed, path, _similar(value, mark.names))
     return checked
 
 
 def _read_by_name(kind: Any, value: Any, path: str) -> tuple[Any, ...]:  # noqa: ANN401
     if not all(isinstance(each, Mapping) for each in (value, *getattr(value, "values", tuple)())):
-        raise type_error(value, f"tables [{path}.NAME]", path)
+        raise wrong_value(value, f"tables [{path}.NAME]", path)
     rows = ((name, {**row, "name": name}) for name, row in value.items())
     return tuple(read_value(kind, row, _joined(path, name)) for name, row in rows)
 
@@ -355,7 +355,7 @@ def _read_tuple(kind: Any, value: object, path: str) -> tuple[Any, ...]:  # noqa
     if isinstance(value, list | tuple) and args[-1] is Ellipsis:
         args = (args[0],) * len(value)
     if not isinstance(value, list | tuple) or len(value) != len(args):
-        raise type_error(value, needed_of(kind), path)
+        raise wrong_value(value, needed_of(kind), path)
     return tuple(
         read_value(kind, item, f"{path}[{index}]")
         for index, (kind, item) in enumerate(zip(args, value, strict=True))
@@ -371,20 +371,20 @@ def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: AN
         if not array.size:
             array = np.zeros((*array.shape, *(0,) * len(form.shape))[: len(form.shape)])
         elif array.dtype.kind not in ("b" if wanted is np.bool_ else "iuf"):
-            raise type_error(value, needed_of(kind), path)
+            raise wrong_value(value, needed_of(kind), path)
         sizes = zip(array.shape, form.shape, strict=False)
         if array.ndim == len(form.shape) and all(has == size or size < 0 for has, size in sizes):
             if fault := form.fault(array) if form.fault else "":
                 raise DataError(f"{path} {fault}.", culprits=[path])
             return array.astype(wanted)
-    raise type_error(value, needed_of(kind), path)
+    raise wrong_value(value, needed_of(kind), path)
 
 
 def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what JSON may hold
     """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
-        raise type_error(value, needed_of(kind), path)
+        raise wrong_value(value, needed_of(kind), path)
     return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
 
 
@@ -392,7 +392,7 @@ def _similar(value: object, names: Collection[Any]) -> str:
     return did_you_mean(value, names) if isinstance(value, str) else ""
 
 
-def type_error(value: object, needed: str, path: str, next_step: str = "") -> DataError:
+def wrong_value(value: object, needed: str, path: str, next_step: str = "") -> DataError:
     """Builds the error for another value than needed."""
     place = path or "the document"
     return DataError(
@@ -412,7 +412,7 @@ def shown(value: object) -> str:
 
 def _table(value: object, path: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise type_error(value, "a table", path)
+        raise wrong_value(value, "a table", path)
     return value
 
 

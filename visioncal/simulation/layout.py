@@ -17,8 +17,8 @@ from visioncal.core.codec import (
     NotNegative,
     Strict,
     WrittenForm,
-    type_error,
     within,
+    wrong_value,
 )
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
@@ -80,7 +80,7 @@ def _named(things: Mapping[str, object]) -> WrittenForm:
 
     def named(name: object, path: str) -> object:
         if name not in things:
-            raise type_error(name, f"one of {', '.join(things)}", path)
+            raise wrong_value(name, f"one of {', '.join(things)}", path)
         return things[str(name)]
 
     return WrittenForm(str, named)

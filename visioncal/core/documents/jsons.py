@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.core.codec import shown, type_error
+from visioncal.core.codec import shown, wrong_value
 from visioncal.core.documents.toml import MAX_VALUES, check_values, too_deep, too_many
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
@@ -193,7 +193,7 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
     # Squares and products of larger numbers may overflow.
     document = parse_json(text, label, 1e60)
     if not isinstance(document, dict):
-        raise type_error(document, "a table", label)
+        raise wrong_value(document, "a table", label)
     return document
 
 

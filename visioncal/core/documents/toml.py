@@ -9,7 +9,7 @@ from pathlib import Path
 from types import GenericAlias
 from typing import Annotated, Any, Literal
 
-from visioncal.core.codec import Finite, Positive, read_value, type_error, within
+from visioncal.core.codec import Finite, Positive, read_value, within, wrong_value
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, absence, one_line, read_text
 from visioncal.core.number_format import did_you_mean
@@ -177,7 +177,7 @@ class DocumentTable:
 
     def refuse(self, key: str, value: object, needed: str, next_step: str = "") -> DataError:
         """Builds the error for a field with an invalid value."""
-        return type_error(value, needed, f"{self.label}: {key}", next_step)
+        return wrong_value(value, needed, f"{self.label}: {key}", next_step)
 
     def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
         """Reads a finite number, greater than zero if `positive`."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.core.codec import type_error
+from visioncal.core.codec import wrong_value
 from visioncal.core.errors import DataError
 from visioncal.core.files import UTF16_MARKS, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
@@ -56,21 +56,21 @@ def as_numbers(value: object, where: str) -> FloatArray:
             return np.array(value, dtype=float)
         except (ValueError, TypeError, OverflowError):
             pass
-    raise type_error(value, "numbers", where)
+    raise wrong_value(value, "numbers", where)
 
 
 def number(value: object, where: str) -> float:
     """Reads one finite number; raises DataError."""
     numbers = as_numbers(value, where)
     if numbers.size != 1 or not np.isfinite(numbers).all():
-        raise type_error(value, "one finite number", where)
+        raise wrong_value(value, "one finite number", where)
     return float(numbers.reshape(-1)[0])
 
 
 def mapping(value: object, where: str) -> Mapping[str, Any]:
     """Checks that a value is a mapping; raises DataError."""
     if not isinstance(value, Mapping):
-        raise type_error(value, "keys with values", where)
+        raise wrong_value(value, "keys with values", where)
     return value
 
 

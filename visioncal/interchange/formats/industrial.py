@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 
+from visioncal.core.codec import wrong_value
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
@@ -172,9 +173,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
         places.append(name)
     static = document.get("static_camera")
     if not isinstance(static, bool | None):
-        raise DataError(
-            f"{file}: static_camera is {static!r}, but must be true or false.", culprits=[str(file)]
-        )
+        raise wrong_value(static, "true or false", f"{file}: static_camera")
     views = tuple(index for name in places if (index := number_in(name)) is not None)
     views = views if len(set(views)) == len(places) else ()
     fields = fields_of_records(records, places, file.parent.name, file.parent, views)
