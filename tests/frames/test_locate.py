@@ -577,6 +577,19 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
     assert "tool" not in touch_test_finding(evaluate_gaps(points, [9.0] * 5)).do.words
 
 
+def test_images_that_disagree_are_named_before_their_wide_targets(proved, tmp_path):
+    folder, look, _ = proved
+    session = Session.load(look)
+    first, *others = session.views
+    pushed = replace(first, numbers=first.numbers | {"x_m": first.numbers["x_m"] + 2e-3})
+    for name, views in (("sound", (first, *others)), ("pushed", (pushed, *others[:1]))):
+        replace(session, views=views).save(tmp_path / name)
+    sound = visioncal("touch-test", tmp_path / "sound", "-c", folder / "out", *GAUGE).good()
+    assert "in doubt" not in sound.err
+    done = visioncal("touch-test", tmp_path / "pushed", "-c", folder / "out", *GAUGE).good()
+    assert "Where the board lies is in doubt: The images disagree" in done.err
+
+
 @pytest.mark.slow
 def test_targets_are_printed_and_gaps_join_the_result(proved):
     folder, look, _ = proved

@@ -286,6 +286,17 @@ def test_a_moved_board_is_left_out_and_named():
     assert misfit(frame.edge, true_place(IN_HAND, "fixture")) < 22.5
 
 
+def test_images_of_other_poses_precede_the_sigmas_that_follow_of_them():
+    cell, calibration = calibrated_cell(IN_HAND)
+    rows = shots(cell, 4)
+    others = [replace(row, base_from_flange=cell.robot.base_from_flange[at])
+              for row, at in zip(rows, (9, 3, 1, 7), strict=True)]  # fmt: skip
+    verdict = seen_frame(session_of(cell, others), calibration, "fixture").verdict
+    assert verdict.status == "bad"
+    assert "images disagree" in verdict.findings[0].words
+    assert verdict.next_steps[0].command == "visioncal doctor SESSION"
+
+
 def test_views_that_show_nothing_are_named():
     cell, calibration = calibrated_cell(IN_HAND)
     session = session_of(cell, [*shots(cell, 6), Shot(6, None)], role=[""] * 5 + ["holdout", ""])

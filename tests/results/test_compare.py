@@ -14,7 +14,8 @@ from support.samples import made_up
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Camera
-from visioncal.results import Calibration, CameraResult, Edge, ViewResult
+from visioncal.core.verdict import Verdict
+from visioncal.results import Calibration, CameraResult, Edge, Frame, ViewResult
 from visioncal.results.compare import FALSE_ALARMS, compare, to_document
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
@@ -58,6 +59,26 @@ def test_a_moved_board_is_no_moved_camera(mount):
     assert [edge.is_change for edge in comparison.edges] == [False, True]
     assert comparison.findings[0].startswith("The board was moved")
     assert "its calibration still holds" in comparison.findings[0]
+
+
+def test_a_tool_that_was_exchanged_is_no_equal_result():
+    first = pair("eye-in-hand")[0]
+    tip = np.eye(4)
+    frames = {}
+    for name, length_m in (("short", 0.15), ("long", 0.155)):
+        tip[2, 3] = length_m
+        edge = Edge(tip.copy(), 1e-10 * np.eye(6))
+        frames[name] = Frame(edge, True, "pivot", "touches", "", 0.1, 0.1, (), Verdict("good"))
+    short, long = (
+        replace(first, frames={"flange_from_gripper": frames[name]}) for name in ("short", "long")
+    )
+    comparison = compare(short, long)
+    assert not comparison.is_equal
+    assert [edge.name for edge in comparison.edges if edge.is_change] == ["flange_from_gripper"]
+    assert comparison.edges[-1].moved_mm == pytest.approx(5.0)
+    assert any(words.startswith("flange_from_gripper changed") for words in comparison.findings)
+    assert compare(short, short).is_equal
+    assert compare(first, short).only_in_b == ("flange_from_gripper",)
 
 
 def test_a_change_of_the_lens_is_found():

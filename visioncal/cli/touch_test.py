@@ -1,6 +1,7 @@
 """`visioncal touch-test`."""
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.parsing import numbers_in, refuse_given
+from visioncal.core.verdict import Verdict
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.touch_test import (
     TouchPoint,
@@ -42,6 +44,8 @@ from visioncal.results.compensation.correction import correct
 from visioncal.results.history import entries_of
 from visioncal.session import Session
 from visioncal.session.images import IMAGE_ENDINGS, MemoryImages
+
+_PLACE = "where the board lies"
 
 
 def touch_test_command(options: TouchTestOptions) -> None:
@@ -66,12 +70,10 @@ def touch_test_command(options: TouchTestOptions) -> None:
         located = touch_targets(loaded, result, touching, clearance_m)
     used = {
         "the calibration": result.verdict,
-        "where the board lies": located.board.verdict,
+        _PLACE: located.board.verdict,
         **({} if touching is None else {touching.name: touching.verdict}),
     }
-    for what, verdict in used.items():
-        for warning in check_usable(verdict, what, force=options.force):
-            warn(warning)
+    _check_used(used, force=options.force)
     points = located.points
     known = controller_form("", options.robot_form) or result.controller()
     # No pendant's angles are taken for another's where no maker is known: a quaternion.
@@ -107,6 +109,16 @@ def touch_test_command(options: TouchTestOptions) -> None:
     else:
         answer(touch_test_finding(test).reason)
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
+
+
+def _check_used(used: Mapping[str, Verdict], *, force: bool) -> None:
+    """Refuses what is bad, and warns of a place in doubt, whose wide radius lets gaps pass."""
+    for what, verdict in used.items():
+        for warning in check_usable(verdict, what, force=force):
+            warn(warning)
+    place = used[_PLACE]
+    if place.status == "check":
+        warn(f"{_PLACE.capitalize()} is in doubt: {place.findings[0].words}")
 
 
 def _looked(path: Path, result: Calibration) -> Session:

@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Progress
-from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
+from visioncal.core.verdict import AGREEMENT, Finding, Remedy, Verdict, remarks
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
 from visioncal.frames.fixture import sigma_findings
 from visioncal.frames.naming import PARENTS, FrameKind
@@ -35,6 +35,13 @@ SEEN_BY = "camera_calibrated"
 _COUNTED_TWICE = (
     "the sigma holds the camera's own calibration: a pick by the same camera on a plane of this "
     "frame counts it twice"
+)
+# Scatter of images over the noise from which on they do not belong to their poses.
+_WILD = 10.0
+_BELONG = Remedy(
+    "Look whether images and poses of each row belong together and are read rightly, which doctor "
+    "finds; and whether the calibration still holds (visioncal verify).",
+    "visioncal doctor SESSION",
 )
 _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
@@ -100,7 +107,7 @@ def seen_frame(
     elsewhere = PARENTS[other]
     has_poses = all(sight.base_from_flange is not None for sight in sights)
     # So much wilder than the noise: it may be fixed to the other parent, and calm against that.
-    if seen.scatter >= 10.0 and (has_poses or not needs_robot(eye, elsewhere)):
+    if seen.scatter >= _WILD and (has_poses or not needs_robot(eye, elsewhere)):
         alternative = place_target(eye, sights, looks, elsewhere)
         if alternative.rms_mm < 0.1 * seen.rms_mm:
             lying = " A touch test wants an image of a board that lies where the robot works."
@@ -119,10 +126,15 @@ def seen_frame(
         else "Most of it is the same in all images (the camera's calibration, the target's size, "
         "the arm's errors): a better calibration helps, more images do not."
     )
-    warnings = remarks(seen.warnings)
+    poor = [*sigma_findings(worst, options.sigma_mm, options.sigma_deg, advice)]
+    # Directions that are poorly known follow from images that disagree, and come after these.
+    is_bad, step = any(found.is_fatal for found in poor), _BELONG if seen.scatter >= _WILD else None
     findings = [
-        *(replace(remark, is_fatal=remark.words in eye.warnings) for remark in warnings),
-        *sigma_findings(worst, options.sigma_mm, options.sigma_deg, advice),
+        *(
+            replace(remark, is_fatal=is_bad or remark.words in eye.warnings, do=step)
+            for remark in remarks(seen.warnings)
+        ),
+        *poor,
     ]
     missing = {view: why for view, why in lost.items() if why != HELD_BACK}
     if len(missing) > 0.25 * len(session.views):

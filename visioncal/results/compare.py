@@ -22,6 +22,7 @@ FALSE_ALARMS = 0.01
 # Smallest standard deviation in a test [rad, m], for exact data.
 _LEAST_SIGMA = 1e-9
 _NOTHING = "No transform changed: noise explains what differs."
+_NOTHING_ELSE = "Of what was calibrated nothing changed: noise explains what differs."
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Comparison:
     verdicts: tuple[VerdictStatus, VerdictStatus]  # The verdict of each.
     # Whether both are of the same session, so that they share its noise and are not independent.
     same_session: bool
-    edges: tuple[EdgeChange, ...]  # The transforms that both have.
+    edges: tuple[EdgeChange, ...]  # The transforms that both have, then the tools and fixtures.
     only_in_a: tuple[str, ...]  # Names of transforms that only the first has.
     only_in_b: tuple[str, ...]  # Names of transforms that only the second has.
     # The intrinsics, where both cameras have the same model and resolution.
@@ -160,7 +161,7 @@ def compare(
             calibration.chosen(choice if neither or calibration.cell is not None else ANY)
             for calibration in (a, b)
         )
-    names = [name for name in a.edges if name in b.edges]
+    names = [name for name in a.placed if name in b.placed]
     # Two tests for each transform, and one for the lens.
     limit = FALSE_ALARMS / (2 * len(names) + 1)
     # Of a noise level: three residuals a view less half of twelve unknowns.
@@ -177,8 +178,8 @@ def compare(
         verdicts=(a.verdict.status, b.verdict.status),
         same_session=a.session_sha256 == b.session_sha256,
         edges=edges,
-        only_in_a=tuple(name for name in a.edges if name not in b.edges),
-        only_in_b=tuple(name for name in b.edges if name not in a.edges),
+        only_in_a=tuple(name for name in a.placed if name not in b.placed),
+        only_in_b=tuple(name for name in b.placed if name not in a.placed),
         lens=lens,
         noise={
             name: (levels[0].get(name), levels[1].get(name)) for name in {**levels[0], **levels[1]}
@@ -193,7 +194,7 @@ def _comparable(a: Calibration, b: Calibration, name: str) -> tuple[Edge, Edge]:
     first, second = a.ray_frame, b.ray_frame
     if name == edge_names(a.mount)[0] and first and second and np.array_equal(first.px, second.px):
         return first.transform, second.transform
-    return a.edges[name], b.edges[name]
+    return a.placed[name], b.placed[name]
 
 
 def _levels(calibration: Calibration) -> Mapping[str, float]:
@@ -270,7 +271,10 @@ def _findings(
         if verdict.status == "bad"
     ]
     yield from bad
-    changed = [edge.name for edge in edges if edge.is_change]
+    every = [edge.name for edge in edges if edge.is_change]
+    changed = [name for name in every if name in a.edges]
+    placed = [name for name in every if name not in a.edges]
+    nothing = _NOTHING_ELSE if placed else _NOTHING
     if bad:
         yield "Whether camera or board moved, a bad result does not show."
     elif a.cell is not None:
@@ -278,12 +282,14 @@ def _findings(
         yield (
             f"{frames} moved, or what they hang on was redefined; the others did not."
             if changed
-            else _NOTHING
+            else nothing
         )
     elif a.mount != b.mount:
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
     else:
-        yield _edge_finding(a.mount, changed)
+        yield _edge_finding(a.mount, changed) or nothing
+    if placed:
+        yield f"{some_of(placed)} changed: exchanged or moved, or found otherwise."
     if lens is not None and lens.is_change:
         yield (
             "The intrinsics differ: another camera, focus or zoom."
@@ -295,7 +301,7 @@ def _findings(
 
 
 def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
-    """Sentence that says whether camera, board or both moved."""
+    """Sentence that says whether camera, board or both moved; empty for none."""
     sensor, seen = ("instrument", "probe") if mount == "instrument" else ("camera", "board")
     in_cell = " in the cell, or the controller's base frame was redefined"
     on_flange = " on the flange, or the controller's tool frame was redefined"
@@ -311,7 +317,7 @@ def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
         return f"{sensor_moved}; the {seen} did not: use the second calibration."
     if is_seen:
         return f"{seen_moved}; the {sensor} did not: its calibration still holds."
-    return _NOTHING
+    return ""
 
 
 # Keys of the document where they differ from the fields' names; None for those by name.
