@@ -16,7 +16,7 @@ from visioncal.dynamics import ArmDynamics
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import LowPass, condition
 from visioncal.dynamics.convention_hypotheses import check_recording
-from visioncal.dynamics.identified import Identified
+from visioncal.dynamics.identified import Identified, judge
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, find_lag, identify, predict, validate
 from visioncal.dynamics.model import DynamicModel, Friction, FrictionTerms, JointMotion
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
@@ -309,6 +309,17 @@ def worlds():
         fresh = multi_sine(6, rng)
         found.append((built, identify(known_arm(), [first], PLAIN), fresh, rng))
     return found
+
+
+def test_friction_that_drives_a_joint_is_a_torque_of_the_other_sign(worlds):
+    sound = worlds[0][1].identified
+    assert not any(finding.kind == "sign" for finding in judge(sound).findings)
+    values = sound.values.copy()
+    values[sound.base.names.index("Fc5")] *= -1.0
+    found = judge(replace(sound, values=values))
+    assert found.status == "bad"
+    assert found.findings[0].words.startswith("Joint 5: its dry friction is -")
+    assert "tau5_nm" in found.findings[0].do.words
 
 
 def test_parameters_are_within_their_sigmas(worlds):

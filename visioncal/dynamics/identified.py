@@ -167,6 +167,10 @@ class Identified:
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
 
 
+# Sigmas by which dry friction below zero is no chance.
+_SURE = 5.0
+
+
 def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
     return "check", Finding(kind, words, do)
 
@@ -181,6 +185,7 @@ def _plan(identified: Identified, words: str) -> Remedy:
 def judge(identified: Identified) -> Verdict:
     """Judges identified dynamics by their predictions, and by what the motion determined."""
     judged = [
+        *_of_signs(identified),
         *_of_differences(identified),
         *_of_lag(identified),
         *_of_prediction(identified),
@@ -191,6 +196,24 @@ def judge(identified: Identified) -> Verdict:
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     )
     return Verdict(worst, tuple(finding for _, finding in judged))
+
+
+def _of_signs(identified: Identified) -> Iterator[_Judged]:
+    """Checks that dry friction brakes each joint: what drives it is a torque of the other sign."""
+    names, values = identified.base.names, identified.values
+    for joint in range(identified.robot.joint_count):
+        if (name := f"Fc{joint + 1}") not in names:
+            continue
+        at = names.index(name)
+        sigma = float(np.sqrt(identified.covariance[at, at]))
+        if values[at] < -_SURE * sigma:
+            words = (
+                f"Joint {joint + 1}: its dry friction is {figure(float(values[at]))} N m (sigma "
+                f"{figure(sigma)}), and friction drives no joint: its torque, or its angle, has "
+                "the other sign."
+            )
+            column = f"tau{joint + 1}_nm"
+            yield "bad", Finding("sign", words, Remedy(f"Change the sign of {column} or its gain."))
 
 
 def _of_differences(identified: Identified) -> Iterator[_Judged]:
