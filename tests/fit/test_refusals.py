@@ -85,7 +85,8 @@ def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch, draws):
     for focal in (60.0, 350.0, 3e4):
         for seed in draws:
             small = made(seed, stops=12, given=False)
-            wild = Camera("brown", TABLE.size, np.array([focal, focal, 900.0, 200.0]), np.zeros(5))
+            matrix = np.array([focal, focal, 900.0, 200.0])
+            wild = Camera("brown", TABLE.resolution, matrix, np.zeros(5))
             monkeypatch.setattr(
                 "visioncal.fit.start.start_lenses", lambda *_, lens=wild: {"cam": lens}
             )
