@@ -168,6 +168,8 @@ def test_stops_are_planned_until_a_need_is_met_in_prediction(tmp_path):
     # Fewer stops show no outlier.
     assert 10 <= len(met["stops"]) < 40
     assert "that meets the need" in done.out
+    # A calibration would estimate the lens, too.
+    assert "if lens and board are as stated" in done.out
     assert met["need"]["mm"] == met["request"]["need"]["mm"] == 0.4
     few = ("--need-mm", "0.4", "--stops", "4")
     done = plan("ur5e", tmp_path / "few", *few)
