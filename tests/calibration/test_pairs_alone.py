@@ -1,6 +1,7 @@
 """Two cameras at one robot: faults that a single pair shows are named, and their commands mend."""
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,14 @@ MIDWAY = 12
 AXIS_M = np.random.default_rng(5).uniform(-0.3, 0.3, 24)
 
 
-def stereo(folder: Path, *, in_hand: bool = True, scale: float = 1.0, stops: int = 24):
+def stereo(
+    folder: Path,
+    *,
+    in_hand: bool = True,
+    scale: float = 1.0,
+    stops: int = 24,
+    more: tuple[BoardAt, ...] = (),
+):
     """Two cameras on a flange and a board before them, or a board in hand before two cameras.
 
     The table has no joint angles, as most recordings.
@@ -36,7 +44,7 @@ def stereo(folder: Path, *, in_hand: bool = True, scale: float = 1.0, stops: int
             CameraAt("left", on, place_m=(0.0, -1.0, 1.1)),
             CameraAt("right", on, place_m=(0.0, 1.0, 1.2)),
         ),
-        boards=(BoardAt("board", board_on, place_m=(0.0, 0.0, 0.05), scale=scale),),
+        boards=(BoardAt("board", board_on, place_m=(0.0, 0.0, 0.05), scale=scale), *more),
         stops=stops,
         seed=1,
     )
@@ -67,10 +75,11 @@ def with_tool(folder: Path, is_active):
     edit_rows(folder, change)
 
 
-def turned(folder: Path, camera: str):
-    """All corners of a camera are numbered from the other end of the board."""
+def turned(folder: Path, camera: str, is_one=bool):
+    """All corners in a camera's rows, or in some, are numbered from the other end of the board."""
     with (folder / "views.csv").open(encoding="utf-8") as file:
-        views = {row["view"] for row in csv.DictReader(file) if row["camera"] == camera}
+        rows = [row for row in csv.DictReader(file) if row["camera"] == camera]
+    views = {row["view"] for row in rows if is_one(row)}
     path = folder / "corners.csv"
     with path.open(encoding="utf-8") as file:
         rows = [*csv.DictReader(file)]
@@ -138,6 +147,44 @@ def test_corners_of_one_camera_that_are_numbered_from_the_other_end(tmp_path, mo
     words = "cam_.* numbers the corners of target_board from the other end"
     raised(DegenerateError, words, visioncal.calibrate, "cell")
     mended(cell)
+
+
+def test_a_fixed_board_before_a_fixed_camera_that_some_rows_number_from_the_other_end(
+    tmp_path, monkeypatch
+):
+    """No robot is between both."""
+    monkeypatch.chdir(tmp_path)
+    floor = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
+    cell = stereo(tmp_path / "cell", in_hand=False, more=(floor,))
+    turned(
+        tmp_path / "cell",
+        "right",
+        lambda row: row["target"] == "floor" and int(row["stop"]) % 5 == 2,
+    )
+    cause = visioncal.calibrate("cell").verdict.causes[0]
+    assert cause.kind == "turned_board"
+    assert "target_floor was read turned by 180 deg" in cause.words
+    mended(cell)
+
+
+def test_rows_that_are_shifted_are_counted_by_the_stops_of_their_robot(tmp_path, monkeypatch):
+    """Each camera sees every other stop: two stops are one of its rows."""
+    monkeypatch.chdir(tmp_path)
+    stereo(tmp_path / "cell", in_hand=False, stops=20)
+
+    def change(rows: Rows) -> Rows:
+        shown = [{name: row[name] for name in POSE} for row in rows]
+        return [
+            row | (shown[min(at + 2, len(rows) - 1)] if at >= 8 else {})
+            for at, row in enumerate(rows)
+        ]
+
+    edit_rows(tmp_path / "cell", change)
+    cause = visioncal.calibrate("cell").verdict.causes[0]
+    assert cause.kind == "shifted_rows"
+    assert re.search(r"--shift \d+-19:-2", cause.do.command)
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert followed.last.status == 0
 
 
 def test_a_rail_with_a_column_is_added_to_all_rows_of_its_robot(tmp_path, monkeypatch):

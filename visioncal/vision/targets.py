@@ -312,6 +312,18 @@ def _bounds(target: Target) -> tuple[FloatArray, FloatArray]:
     return corners_m.min(axis=0, keepdims=True), corners_m.max(axis=0, keepdims=True)
 
 
+def half_turn_of(target: Target) -> tuple[FloatArray, tuple[float, float]]:
+    """The half turn (4, 4) of a target in its plane about its middle, and that middle [m].
+
+    A target whose corners are numbered from the other end has its frame turned so.
+    """
+    corners = corner_positions(target)
+    x, y, _ = (0.5 * (corners.min(axis=0) + corners.max(axis=0))).tolist()
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turn[:2, 3] = 2.0 * x, 2.0 * y
+    return turn, (x, y)
+
+
 def rotation_transforms(target: Target) -> FloatArray:
     """Rotations in the plane that map the printed pattern to itself.
 

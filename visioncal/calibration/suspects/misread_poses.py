@@ -23,6 +23,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import exchanged_columns
+from visioncal.calibration.stages.cell import rows_of_robot
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -32,6 +33,7 @@ from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.moved_views import IN_MOTION
 from visioncal.calibration.suspects.other_rows import of_other_rows
 from visioncal.calibration.suspects.pairs_alone import of_all_rows
+from visioncal.calibration.suspects.record import StopOfRobot
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
@@ -138,8 +140,9 @@ def with_undone(run: RunState) -> RunState:
             run = undone(run, mistake)
         return run
     for robot in run.session.robots:
+        stops, commands = _stops_of(run, robot), set[str]()
         for pair in pairs_of(run, robot):
-            mistake = likeliest(of_pair(run, robot, pair))
+            mistake = likeliest(of_pair(run, robot, pair), stops)
             if mistake is None:
                 continue
             whose = robot_words(robot)
@@ -150,11 +153,26 @@ def with_undone(run: RunState) -> RunState:
                 others = [at.number for at in run.session.views if at.number not in found.views]
                 do = or_alone(do.words, others)
             else:
-                do = of_all_rows(found, run, robot)
+                do = of_all_rows(found, run, robot, pair)
             found = replace(found, words=f"{whose}: {found.words}", do=do)
-            run = undone(run, replace(mistake, found=found))
+            # One command mends the robot's rows of all pairs.
+            command = "" if do is None else do.command
+            run = undone(run, replace(mistake, found=found), is_named=command in commands)
+            commands |= {command} - {""}
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
+
+
+def _stops_of(run: RunState, robot: str) -> dict[int, StopOfRobot]:
+    """The stops of a robot of a cell, in the order of its rows; none where a row has no stop."""
+    found = dict[int, StopOfRobot]()
+    by_view = run.robots[robot].base_from_flange if robot in run.robots else {}
+    for view in rows_of_robot(run.session, robot):
+        if view.stop is None:
+            return {}
+        if view.number in by_view:
+            found.setdefault(view.stop, StopOfRobot(view.number, by_view[view.number]))
+    return found
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:

@@ -376,7 +376,7 @@ def rows_apart(
     when = when if side[-1] or side[0] else f"From view {first} to view {last}"
     when, left = ("In all views", "") if side.all() else (when, " They were left out.")
     # A pose is of one image.
-    partners = set(record.rows[side].tolist())
+    partners = range(record.rows[side][0], record.rows[side][-1] + 1)
     both = zip(views, pairs[by][side].tolist(), strict=True)
     lost = [str(view) for view, pair in both if pair not in partners]
     dropped = f" No row is left for view {some_of(lost)}." if lost else ""

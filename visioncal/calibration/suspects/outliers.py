@@ -9,16 +9,22 @@ import numpy as np
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_names, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.calibration.suspects.moved_views import PoseFault, fault_of, of_moved, pushed_base
+from visioncal.calibration.suspects.moved_views import (
+    KNOCKED,
+    PoseFault,
+    fault_of,
+    of_moved,
+    pushed_base,
+)
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, listed, some_of, view_words
-from visioncal.core.transforms import pose_difference
+from visioncal.core.number_format import figure, listed, ranges, some_of, view_words
+from visioncal.core.transforms import distances, invert, pose_difference
 from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Remedy, mending
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import object_name
-from visioncal.vision.targets import rotation_transforms
+from visioncal.vision.targets import half_turn_of, rotation_transforms
 
 # Kinds of findings, which others name.
 EXCHANGED, MISNAMED = "exchanged_views", "misnamed_rows"
@@ -93,6 +99,7 @@ def explained_outliers(
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
+    faults += _turned(cell_fit, outliers) if not faults else ()
     if cell_fit.cell.mount is not None and not faults:
         faults += of_moved(cell_fit, outliers)
     if cell_fit.cell.mount is None and not faults:
@@ -100,6 +107,30 @@ def explained_outliers(
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, circles) for at in outliers.tolist()} | clauses
     return tuple(faults), *_reasons(cell_fit, causes)
+
+
+def _turned(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
+    """Outliers whose boards are turned by 180 deg, as where corners are numbered from their end."""
+    problem, state, rows = cell_fit.inlier_fit.problem, cell_fit.fit.state, cell_fit.cell.rows
+    steps = invert(problem.predicted(state)[outliers]) @ problem.measured(state)[outliers]
+    session = cell_fit.cell.session
+    for name, board in session.boards.items():
+        frame = session.board_frames[name]
+        half_turn, (x, y) = half_turn_of(board)
+        away_m, away_rad = distances(half_turn[None], steps)
+        seen = np.array([rows[at].seen == frame for at in outliers.tolist()])
+        is_turned = seen & (1e3 * away_m < KNOCKED[0]) & (np.rad2deg(away_rad) < KNOCKED[1])
+        if not is_turned.any():
+            continue
+        some = outliers[is_turned].tolist()
+        views = [rows[at].view for at in some]
+        middle = f"{1e3 * x:.2f},{1e3 * y:.2f}"
+        short = f"{frame} was read turned by 180 deg in its plane"
+        words = (
+            f"in {{views}} {short}, its corners numbered from the other end. They were left out."
+        )
+        do = mending("it is turned back", f"--turned {ranges(views)}:180,{middle}")
+        yield fault_of(cell_fit, "turned_board", some, words, do, short)
 
 
 def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:

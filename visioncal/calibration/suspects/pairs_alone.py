@@ -26,7 +26,7 @@ from visioncal.core.verdict import Finding, Remedy, mending, or_alone
 from visioncal.estimation.unknowns import EDGE
 from visioncal.session import Session
 from visioncal.session.frames import object_name
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.targets import half_turn_of
 
 PairRun = Callable[[Session, Mapping[int, Corners]], RunState]
 
@@ -132,10 +132,13 @@ def _of_robot(run: RunState, robot: str, found: Sequence[tuple[PairAlone, Findin
     return replace(cause, do=of_all_rows(cause, run, robot), probability=0.0)
 
 
-def of_all_rows(found: Finding, run: RunState, robot: str) -> Remedy | None:
+def of_all_rows(
+    found: Finding, run: RunState, robot: str, pair: CameraTargetPair | None = None
+) -> Remedy | None:
     """A finding's remedy whose command changes all rows of a robot at the stops of its views.
 
-    Between two rows that are shifted all are, whether or not they are of the same pair.
+    Between two rows that are shifted all are, whether or not they are of the same pair; beyond the
+    first or the last one that a pair has, too.
     """
     do, rows = found.do, run.session.views
     named = None if do is None else _ON_VIEWS.search(do.command)
@@ -147,7 +150,10 @@ def of_all_rows(found: Finding, run: RunState, robot: str) -> Remedy | None:
     if not ends:
         return Remedy(do.words)
     if named[1] == "shift":
-        stops = {at.stop for at in of_robot[ends[0] : ends[-1] + 1]}
+        shown = {*found.views} if pair is None else {*pair.poses}
+        first = 0 if pair is not None and min(shown) in found.views else ends[0]
+        end = None if pair is not None and max(shown) in found.views else ends[-1] + 1
+        stops = {at.stop for at in of_robot[first:end]}
     start, end = named.span(2)
     every = ranges([at.number for at in of_robot if at.stop in stops])
     return replace(do, command=f"{do.command[:start]}{every}{do.command[end:]}")
@@ -218,12 +224,9 @@ def _contradiction(
 
 def _half_turn(board: Target, step: FloatArray) -> tuple[float, float] | None:
     """Middle (2,) [m] about which a board is turned by 180 deg in its plane by a step, if it is."""
-    corners = corner_positions(board)
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    turn[:2, 3] = 2.0 * middle[:2]
+    turn, middle = half_turn_of(board)
     is_turned = np.less(_apart(invert(turn) @ step), CalibrationLimits.arm_errors).all()
-    return (float(middle[0]), float(middle[1])) if is_turned else None
+    return middle if is_turned else None
 
 
 PAIRS_APART = Suspect("pairs_apart", None, 1e-6, of_chain=True, hides=("wrong_views", UNEXPLAINED))

@@ -3,6 +3,7 @@
 Mistakes of a record pair its rows otherwise; see `undoing`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -35,6 +36,14 @@ _WRONG, _WIDTH, _SAME = float(np.log(0.05)), 3.0 * float(np.log(2.0)), 1e-9
 
 
 @dataclass(frozen=True, eq=False)
+class StopOfRobot:
+    """A stop of a whole cell at which a robot's pose is known."""
+
+    view: int  # Number of the first row there with its pose.
+    pose: FloatArray  # (4, 4) `base_from_flange`.
+
+
+@dataclass(frozen=True, eq=False)
 class Record:
     """The poses of one robot and what one camera saw of one board, by row of the session.
 
@@ -52,35 +61,43 @@ class Record:
     are_places: bool  # Whether only the places of a point were read, whose rotations mean nothing.
 
     @classmethod
-    def of(cls, run: RunState) -> Self:
-        """The record of a run after the stage `pnp`, of one robot and one camera."""
+    def of(cls, run: RunState, stops: Mapping[int, StopOfRobot] | None = None) -> Self:
+        """The record of a run after the stage `pnp`, of one robot and one camera.
+
+        `stops` are all of the robot in a whole cell, of which the run has those of one pair: rows
+        are counted by them.
+        """
         seen, session, read = run.poses_of_one_board, run.session, run.readings
-        every = session.views
+        every = {view.number: view for view in session.views}
         if read is not None and len(read.names) > 1:
             # Rows of several points repeat the pose of their stop.
             of_point = places_of_one_point(read)
-            every = tuple(view for view in every if view.number in of_point)
-        views = [view.number for view in every]
+            every = {number: view for number, view in every.items() if number in of_point}
+        known = {number: run.base_from_flange.get(number) for number in every}
+        if stops and len({view.stop for view in every.values()} & stops.keys()) == len(every):
+            at_stop = {view.stop: number for number, view in every.items()}
+            known = {at_stop.get(stop, of.view): of.pose for stop, of in stops.items()}
+        views = [*known]
         robot = np.full((len(views), 4, 4), np.nan)
         rows, camera = [], list[FloatArray]()
         turns = {name: rotation_transforms(board) for name, board in session.boards.items()}
         excluded = run.held_back | run.spared.keys()
-        for at, view in enumerate(views):
-            if view in run.base_from_flange:
-                robot[at] = run.base_from_flange[view]
-            if view in seen and view not in excluded:
-                own = turns.get(session.board_of(every[at]), np.eye(4)[None])
+        for at, (view, pose) in enumerate(known.items()):
+            if pose is not None:
+                robot[at] = pose
+            if view in seen and view in every and view not in excluded:
+                own = turns.get(session.board_of(every[view]), np.eye(4)[None])
                 rows.append(at)
                 camera.append((seen[view].cam_from_target[:, None] @ own).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
         mount: Mount = run.mount or "eye-in-hand"
         mount = mount if read is None else "eye-to-hand"
-        known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
+        chain, shown = robot_part(robot, mount), np.array(rows, dtype=int)
         marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
         is_numbered = bool(run.corners) and len(marks) > 0
         shows, are_places = ("image", False) if read is None else ("reading", not read.are_poses)
-        of_rows = np.array(views), known, mount, shown, np.array(padded), marks, is_numbered
+        of_rows = np.array(views), chain, mount, shown, np.array(padded), marks, is_numbered
         return cls(*of_rows, shows, are_places)
 
     def paired(self, order: IntArray) -> IntArray:

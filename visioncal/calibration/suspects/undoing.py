@@ -9,7 +9,7 @@ whose noise is integrated out. No level of a wrong fit enters, and not even half
 right.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +37,7 @@ from visioncal.calibration.suspects.mistaken_rows import (
     rows_apart,
     turned_rows,
 )
-from visioncal.calibration.suspects.record import LEAST, Edges, Record, evidence
+from visioncal.calibration.suspects.record import LEAST, Edges, Record, StopOfRobot, evidence
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.number_format import ranges, view_words
@@ -53,25 +53,26 @@ _NEARLY = 0.15
 _IN_PLACE_M = 0.01
 
 
-def undone(run: RunState, found: Undoing) -> RunState:
-    """Leaves out the views that a mistake of the record explains, and names it."""
+def undone(run: RunState, found: Undoing, *, is_named: bool = False) -> RunState:
+    """Leaves out the views that a mistake of the record explains, and names it if it is new."""
     views = set(found.found.views)
     left = {view: pose for view, pose in run.poses.items() if view not in views}
     if len(left) <= FEWEST_COMPARED:
         return replace(run, misread=(found.found,))
     run = replace(run, poses=left, misread=run.misread or ())
     reasons = (Rejection(view, f"{found.short}, as the other views show") for view in views)
-    return run.noting(reasons, (found.found,))
+    return run.noting(reasons, () if is_named else (found.found,))
 
 
-def likeliest(run: RunState) -> Undoing | None:
+def likeliest(run: RunState, stops: Mapping[int, StopOfRobot] | None = None) -> Undoing | None:
     """The mistake that is clearly likelier than views wrong for no known reason, if any.
 
-    Of one robot and one camera whose poses stand beside their images, after the stage `pnp`.
+    Of one robot and one camera whose poses stand beside their images, after the stage `pnp`; of a
+    pair in a whole cell, rows are counted by all `stops` of the robot.
     """
     if run.mount is None or run.misread or waits_for_clock(run.session):
         return None
-    record = Record.of(run)
+    record = Record.of(run, stops)
     if len(record.rows) < FEWEST_COMPARED:
         return None
     own = record.paired(np.arange(len(record.views)))
@@ -96,7 +97,7 @@ def likeliest(run: RunState) -> Undoing | None:
     apart = best.of(own)
     (base,), (agrees,) = evidence(apart[None])
     rivals = [*copied_rows(record, best, apart, own, agrees)]
-    if len(record.views) == len(run.session.views):
+    if len(record.views) >= len(run.session.views):
         # Shifted are all rows, of one point as of others.
         rivals += rows_apart(record, every, pairs, float(base))
     if record.shows == "image":
