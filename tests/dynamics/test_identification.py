@@ -311,6 +311,16 @@ def worlds():
     return found
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "N mm, or mA for A"), (1e-3, "kN m")])
+def test_links_that_are_too_heavy_or_light_for_their_reach_name_the_unit(worlds, factor, unit):
+    sound = worlds[0][1].identified
+    assert not any(finding.kind == "torque_unit" for finding in judge(sound).findings)
+    found = judge(replace(sound, values=factor * sound.values))
+    assert found.status == "bad"
+    assert found.findings[0].words.startswith(f"The torques are in another unit ({unit}")
+    assert f"by {1.0 / factor:g}." in found.findings[0].do.words
+
+
 def test_friction_that_drives_a_joint_is_a_torque_of_the_other_sign(worlds):
     sound = worlds[0][1].identified
     assert not any(finding.kind == "sign" for finding in judge(sound).findings)

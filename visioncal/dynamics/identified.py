@@ -167,6 +167,12 @@ class Identified:
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
 
 
+# Standard gravity, for masses by their weight [m/s^2].
+_GRAVITY_M_S2 = 9.80665
+# Mass at the full reach that would have an arm's torques, over the cube of the reach [kg/m^3]. The
+# whole mass of arms is 6 (a light cobot) to 150 (a foundry's robot) by this, a tenth of it or more
+# acts there, and wrong units differ by a thousand.
+_ARM_DENSITY = (0.1, 1000.0)
 # Sigmas by which dry friction below zero is no chance.
 _SURE = 5.0
 
@@ -185,6 +191,7 @@ def _plan(identified: Identified, words: str) -> Remedy:
 def judge(identified: Identified) -> Verdict:
     """Judges identified dynamics by their predictions, and by what the motion determined."""
     judged = [
+        *_of_size(identified),
         *_of_signs(identified),
         *_of_differences(identified),
         *_of_lag(identified),
@@ -196,6 +203,41 @@ def judge(identified: Identified) -> Verdict:
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     )
     return Verdict(worst, tuple(finding for _, finding in judged))
+
+
+def _of_size(identified: Identified) -> Iterator[_Judged]:
+    """Checks that links of an arm of this reach can be as heavy as their torques say."""
+    model = identified.base.model
+    motion = random_motion(model, np.random.default_rng(0))
+    is_link = identified.base.independent < len(model.names) - len(
+        model.terms.names(identified.robot.joint_count)
+    )
+    still = np.zeros_like(motion.q)
+    by_weight, by_inertia = (
+        identified.base.regressor(JointMotion(motion.times_s, motion.q, still, ddq))
+        @ np.where(is_link, identified.values, 0.0)
+        for ddq in (still, motion.ddq)
+    )
+    flange = identified.robot.base_from_flange(motion.q)[:, :3, 3]
+    reach_m = float(np.linalg.norm(flange, axis=1).max())
+    push = float(np.linalg.norm(motion.ddq, axis=1).max())
+    # A torque is at most that of all of the mass at the full reach.
+    mass_kg = max(
+        float(np.abs(by_weight).max()) / (_GRAVITY_M_S2 * reach_m),
+        float(np.abs(by_inertia - by_weight).max()) / (push * reach_m**2),
+    )
+    light, heavy = (density * reach_m**3 for density in _ARM_DENSITY)
+    if light <= mass_kg <= heavy:
+        return
+    factor = 0.001 if mass_kg > heavy else 1000.0
+    unit = "N mm, or mA for A" if mass_kg > heavy else "kN m, or A for mA"
+    words = (
+        f"The torques are in another unit ({unit}): by them links that reach {figure(reach_m)} m "
+        f"have {figure(mass_kg)} kg at that distance, and such arms have {figure(light)} to "
+        f"{figure(heavy)} kg."
+    )
+    step = f"Give tau1_nm ... in N m: multiply them, or their gains, by {factor:g}."
+    yield "bad", Finding("torque_unit", words, Remedy(step))
 
 
 def _of_signs(identified: Identified) -> Iterator[_Judged]:
