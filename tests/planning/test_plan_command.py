@@ -168,14 +168,19 @@ def test_stops_are_planned_until_a_need_is_met_in_prediction(tmp_path):
     # Fewer stops show no outlier.
     assert 10 <= len(met["stops"]) < 40
     assert "that meets the need" in done.out
-    # A calibration would estimate the lens, too.
-    assert "if lens and board are as stated" in done.out
+    # The default print is as large as stated to 0.1 % only.
+    assert "as long as the board is as large as stated to 0.0" in met["condition"]
+    assert met["condition"] in done.out
     assert met["need"]["mm"] == met["request"]["need"]["mm"] == 0.4
     few = ("--need-mm", "0.4", "--stops", "4")
     done = plan("ur5e", tmp_path / "few", *few)
     short = json.loads((tmp_path / "few/plan.json").read_text(encoding="utf-8"))
     assert len(short["stops"]) <= 4
     assert short["need"]["probability"] <= met["need"]["probability"]
+    # The noise of the robot at a pick is beyond that, however many stops there are.
+    done = plan("ur5e", tmp_path / "never", "--need-mm", "0.1")
+    assert "More stops cannot reach it: all candidates together give" in done.out
+    assert "a robot without noise at the pick helps most, and would give" in done.out
 
 
 @pytest.mark.slow

@@ -100,6 +100,29 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     )
 
 
+def test_a_lens_is_predicted_as_well_as_the_corners_of_such_stops_show_it():
+    """Their information on the lens, with free poses, beside that on the stops."""
+    options = exact(replace(CELL, views=6, cut_views=0.0))
+    seen = so_far_of(simulate(options))[0]
+    cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
+    q = simulate(options).robot.joints
+    factors = stop_factors(cell, HAND_EYE, q, estimates_lens=True)
+    lens = slice(12, 12 + 4 + len(cell.camera.distortion))
+    assert factors[:, :6, :12] == pytest.approx(stop_factors(cell, HAND_EYE, q)[:, :, :12])
+    rows = factors[:, 6:, lens]
+    predicted = np.einsum("kij,kil->jl", rows, rows)
+    corners = seen.cell_fit.linearised_corners
+    (sigma_px,) = corners.sigmas_px
+    scale = max(sigma_px, 1e-6) ** 2 / 0.05**2
+    size = lens.stop - lens.start
+    shown = scale * corners.corners.information[:size, :size]
+    units = 1.0 / np.sqrt(np.diag(shown))
+    # To the rounding of exact poses.
+    assert predicted * np.outer(units, units) == pytest.approx(
+        shown * np.outer(units, units), abs=1e-4
+    )
+
+
 def test_the_choice_is_nearly_the_best_of_all():
     """All 495 choices of 4 among 12, by inverting each one's information."""
     few = postures_in_view(CELL, 12)

@@ -255,13 +255,8 @@ def _report(plan: Plan) -> None:
     if plan.need is not None and plan.need.met:
         met = f"{percent(plan.need.probability)} of picks land within {words_of(plan.need.need)}"
         answer(f"that meets the need, with {len(plan.stops)} stops: {met}")
-        if plan.start is None:
-            # A calibration counts these, too; a session that was begun shows what they are.
-            answer(
-                "if lens and board are as stated: state matrix, distortion and "
-                'intrinsics = "hold" in session.toml where the lens is known so well, or plan '
-                "more stops than these, calibrate, and add others with --add"
-            )
+        if plan.need.condition:
+            answer(plan.need.condition)
     if plan.request.start_q is None:
         answer(
             "the way from where the arm stands to the first stop was not checked; --start-joints "

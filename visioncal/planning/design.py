@@ -4,7 +4,7 @@ The I criterion is the mean variance of the positions that count, over the possi
 ("worlds"); the D criterion is the determinant of the covariance of all unknowns (Atkinson, Donev
 and Tobias 2007, chapter 10).
 
-A stop adds six rows F, so that its effect on a covariance C is a rank-six update (Woodbury):
+A stop adds a few rows F, so that its effect on a covariance C is an update of low rank (Woodbury):
 `C - C F^T (1 + F C F^T)^-1 F C`, computed for all candidates in a few products.
 """
 
@@ -53,11 +53,11 @@ class _Reduced:
     """A world in coordinates in which the prior information is the identity.
 
     Attributes:
-        factors: (k, 6, p) whitened Jacobians of the candidates.
+        factors: (k, m, p) whitened Jacobians of the candidates.
         start: (p, p) information without any candidate.
         roots: Roots R (s, p) of the variances that are minimised and reported, of position [m^2]
             and rotation [rad^2]: with a covariance C the variance is trace(R C R^T).
-        unestimated: (k, 6, a) as in `World`.
+        unestimated: (k, m, a) as in `World`.
         gradient: (p, a) as in `World`.
     """
 
@@ -66,7 +66,7 @@ class _Reduced:
         # theta = unwhitened @ phi, where phi has unit prior information. The information of corners
         # on a rational lens is singular to rounding.
         unwhitened = covariance_root(world.prior)
-        self.factors = (world.factors.reshape(-1, size) @ unwhitened).reshape(-1, 6, size)
+        self.factors = world.factors @ unwhitened
         self.start = np.eye(size) + unwhitened.T @ world.recorded @ unwhitened
         self.gradient = unwhitened.T @ world.gradient
         self.unestimated, self.roots = world.unestimated, []
@@ -148,7 +148,7 @@ class _Selection:
         for world, covariance in zip(self.problem, self.covariances, strict=True):
             factors = world.factors[rows]
             carried = factors @ covariance
-            changed = np.eye(6) + sign * carried @ np.swapaxes(factors, 1, 2)
+            changed = np.eye(factors.shape[1]) + sign * carried @ np.swapaxes(factors, 1, 2)
             if self.criterion == "D":
                 gains += sign * np.linalg.slogdet(changed)[1]
                 continue

@@ -13,8 +13,8 @@ from scipy.linalg import block_diag
 from visioncal.core.errors import DataError
 from visioncal.core.linalg import covariance_from, gram
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert, skew
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.transforms import adjoint, compose, invert, skew
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import (
     SCALE,
     Appearance,
@@ -36,8 +36,8 @@ from visioncal.planning.cell import AnyCell, PlanCell, seen_from
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.robot.workspace import postures
-from visioncal.vision.camera import project
-from visioncal.vision.corners import CornerStack, floored_sigma_px
+from visioncal.vision.camera import intrinsics, project
+from visioncal.vision.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.vision.targets import corner_positions, is_seen_in_part
 
 # Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.
@@ -45,6 +45,9 @@ WORLDS = 4
 # A calibration does not use the guesses. This weak prior on the edges only keeps the information
 # invertible [rad and m] in directions that the stops do not determine.
 WEAK_SIGMA = 0.2
+# Likewise on a lens that the stops are to determine: its matrix, as a share of the focal length,
+# and coefficients of distortion. A third radial one is known from ten stops to about 0.7.
+_LENS_SHARE, _DISTORTION_SIGMA = 0.1, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,11 @@ class RecordedStops:
     held: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
+    def stops(self) -> int:
+        """Number of the stops."""
+        return len(next(iter(self.fit.flanges.values())))
+
+    @property
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
         return _effect_information(self.fit.problem)
@@ -79,14 +87,15 @@ class World:
     The unknowns are x, z, free parameters of lens and board, and errors of the arm, in this order.
 
     Attributes:
-        factors: (k, 6, p) whitened Jacobian F of each stop; F^T F is its information.
+        factors: (k, m, p) whitened Jacobian F of each stop; F^T F is its information. The first six
+            rows are of its pose; further ones, of a lens that is estimated, of its corners.
         prior: (p, p) prior information.
         recorded: (p, p) information of the recorded stops.
         objective: (p, p) weight W such that trace(W C) is the variance to be minimised with a
             covariance C: of a position, as a mean over where it matters [m^2].
         position: (p, p) the same for the position whose accuracy is reported [m^2].
         rotation: (p, p) the same for the rotation [rad^2].
-        unestimated: (k, 6, a) whitened Jacobian of each stop in parameters that a fit does not
+        unestimated: (k, m, a) whitened Jacobian of each stop in parameters that a fit does not
             estimate: arm errors that it treats as noise, in their sigmas, and held parameters of
             lens and boards.
         gradient: (p, a) the same of the recorded stops' gradient.
@@ -124,32 +133,50 @@ def predict_worlds(
     q: FloatArray,
     *,
     recorded: RecordedStops | None = None,
+    estimates_lens: bool = False,
 ) -> tuple[World, ...]:
     """Predicts the information of candidates with joints (k, n) [rad] in each possible cell.
+
+    Args:
+        cells: The possible cells.
+        purpose: The purpose of the stops.
+        q: The candidates.
+        recorded: Stops that were recorded already.
+        estimates_lens: Whether the stops determine the lens, too.
 
     Raises:
         DataError: Joint angles of recorded stops are needed and not known.
     """
     with one_blas_thread():
-        return tuple(_world(cell, purpose, q, recorded) for cell in cells)
+        return tuple(
+            _world(cell, purpose, q, recorded, estimates_lens=estimates_lens) for cell in cells
+        )
 
 
 def stop_factors(
-    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None = None
+    cell: PlanCell,
+    purpose: Purpose,
+    q: FloatArray,
+    recorded: RecordedStops | None = None,
+    *,
+    estimates_lens: bool = False,
 ) -> FloatArray:
-    """Whitened Jacobian F (k, 6, p + a) of stops with joints (k, n) [rad]; F^T F is information.
+    """Whitened Jacobian F (k, m, p + a) of stops with joints (k, n) [rad]; F^T F is information.
 
     It is zero where the board is not seen. Errors of the arm that a fit treats as noise come last.
     Lens and board are those of the recorded stops; without any, the stated ones, with the stated
-    uncertainty of the board's size.
+    uncertainty of the board's size. There are six rows, and those of a lens that is estimated.
     """
-    free = stated(cell) if recorded is None else recorded.free
+    free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
+    lens = free.columns < len(intrinsics(free.appearance.camera))
+    lens &= ~free.anchored & estimates_lens
     poses = cell.cam_from_target(q)
     stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
     information = free.information if recorded is None else recorded.shared
     # The other shared parameters do not affect a stop at which the arm stands still.
     others = np.zeros((int(seen.sum()), 6, len(information) - len(free.columns)))
-    factors = np.zeros((len(q), 6, 12 + len(information) + arm_size(cell.robot, purpose, recorded)))
+    columns = 12 + len(information) + arm_size(cell.robot, purpose, recorded)
+    factors = np.zeros((len(q), 6 + int(lens.sum()), columns))
     if seen.any():
         compressed = compress(stack, free.basis, free.appearance, poses[seen])
         flange = cell.robot.base_from_flange(q[seen])
@@ -169,33 +196,118 @@ def stop_factors(
         state = State(np.stack([cell.x, cell.z]), problem.start_values)
         linear = problem.linear(state, ideal=True)
         root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
-        factors[seen] = np.linalg.solve(root, linear.jacobian)
+        factors[seen, :6] = np.linalg.solve(root, linear.jacobian)
+        if lens.any():
+            found = _lens_rows(stack, free, poses[seen], free.columns[lens], cell.pixel_px)
+            at = 12 + np.flatnonzero(lens)
+            factors[np.ix_(np.flatnonzero(seen), np.arange(6, factors.shape[1]), at)] = found
     return factors
 
 
-def stated(cell: PlanCell) -> LensBoardParameters:
-    """Stated lens and board; the board's size is free within its stated uncertainty."""
+def _lens_rows(
+    stack: CornerStack,
+    free: LensBoardParameters,
+    poses: FloatArray,
+    columns: IntArray,
+    pixel_px: float,
+) -> FloatArray:
+    """(v, l, l) whitened Jacobian by l intrinsics of what v views show of them with free poses."""
+    camera = free.appearance.camera
+    bent = replace(stack, points=stack.points + free.basis[stack.ids] @ free.appearance.board)
+    seen, units = reproject(bent, camera, poses), _lens_sigmas(camera)[columns]
+    by_lens = seen.by_intrinsics[:, :, columns] * units
+    left = WithoutPoses.of(bent, seen.by_pose, by_lens, None).left
+    values, vectors = np.linalg.eigh(bent.products_by_view(left, left))
+    roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.mT
+    return np.asarray(roots / (units * floored_sigma_px(pixel_px)))
+
+
+def _lens_sigmas(camera: Camera) -> FloatArray:
+    """(k,) weak prior sigmas of a camera's intrinsics."""
+    sigmas = np.full(len(intrinsics(camera)), _DISTORTION_SIGMA)
+    sigmas[:4] = _LENS_SHARE * camera.matrix[0]
+    return sigmas
+
+
+def parameters_of(
+    cell: PlanCell, recorded: RecordedStops | None, *, estimates_lens: bool
+) -> LensBoardParameters:
+    """Free parameters of lens and boards: those of recorded stops, or of the stated cell."""
+    return stated(cell, estimates_lens=estimates_lens) if recorded is None else recorded.free
+
+
+def stated(cell: PlanCell, *, estimates_lens: bool = False) -> LensBoardParameters:
+    """Stated lens and board; the board's size is free within its stated uncertainty.
+
+    A lens that is estimated is free, too.
+    """
     positions = corner_positions(cell.target)
     shape = stated_board_sigma(cell.target)
     look = Appearance(cell.camera, np.zeros(len(shape)))
     # The positions of a rig's points are taken as exact.
     sized = np.array([] if cell.target.is_rig else [SCALE], dtype=np.int64)
+    size = len(look.values) - len(shape)
+    lens = np.arange(size if estimates_lens else 0)
+    sigmas = np.concatenate([_lens_sigmas(cell.camera)[lens], shape[sized]])
     return LensBoardParameters(
         look,
         shape_basis(cell.target),
         positions,
-        len(look.values) - len(shape) + sized,
-        np.ones(len(sized), dtype=bool),
-        np.diag(shape[sized] ** -2.0),
-        np.zeros(len(sized)),
+        np.concatenate([lens, size + sized]),
+        np.arange(len(sigmas)) >= len(lens),
+        np.diag(sigmas**-2.0),
+        np.zeros(len(sigmas)),
     )
 
 
+def pick_jacobian(
+    cell: PlanCell,
+    q: FloatArray,
+    recorded: RecordedStops | None,
+    size: int,
+    *,
+    estimates_lens: bool,
+) -> FloatArray:
+    """Jacobian (k, 6, p) of things that the camera sees where stops see the board's middle.
+
+    Args:
+        cell: The cell.
+        q: (k, n) joint angles of the stops [rad].
+        recorded: Stops that were recorded already.
+        size: Number p of the unknowns.
+        estimates_lens: Whether the stops determine the lens, too.
+
+    Returns:
+        By the unknowns, of rotation [rad] and position [m], in the axes of what carries the camera:
+        the flange, or the base. The size of things is not that of the board.
+    """
+    poses, middle = cell.cam_from_target(q), corner_positions(cell.target).mean(axis=0)
+    points, jacobian = (poses @ [*middle, 1.0])[:, :3], np.zeros((len(q), 6, size))
+    jacobian[:, :, :6] = adjoint(compose(np.eye(3), -points))
+    free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
+    lens = np.flatnonzero(free.columns < len(intrinsics(free.appearance.camera)))
+    stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
+    if len(lens) and seen.any():
+        moved = compress(stack, free.basis, free.appearance, poses[seen]).by_shared
+        turn = compose(poses[seen, :3, :3], np.zeros(3)) @ compose(np.eye(3), -middle)
+        jacobian[np.ix_(seen, np.arange(6), 12 + lens)] = (
+            adjoint(turn) @ moved[:, :, free.columns[lens]]
+        )
+    turn = cell.x[:3, :3]
+    return np.asarray(block_diag(turn, turn) @ jacobian)
+
+
 def _world(
-    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None
+    cell: PlanCell,
+    purpose: Purpose,
+    q: FloatArray,
+    recorded: RecordedStops | None,
+    *,
+    estimates_lens: bool,
 ) -> World:
-    shared = stated(cell).information if recorded is None else recorded.shared
-    factors = stop_factors(cell, purpose, q, recorded)
+    free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
+    shared = free.information if recorded is None else recorded.shared
+    factors = stop_factors(cell, purpose, q, recorded, estimates_lens=estimates_lens)
     shared_count, sigma = len(shared), arm_sigma(purpose)
     arm = arm_size(cell.robot, purpose, recorded)
     if recorded is not None and not purpose.blocks and recorded.arm is not None:
@@ -276,8 +388,7 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
             culprits=["q1_rad"],
             next_step="Record q1_rad ..., or plan without the recorded session.",
         )
-    stops = len(next(iter(recorded.fit.flanges.values())))
-    joints = np.zeros((stops, cell.robot.joint_count)) if q is None else q
+    joints = np.zeros((recorded.stops, cell.robot.joint_count)) if q is None else q
     problem = with_arm_errors(cell, purpose, recorded.fit.problem, joints, recorded.arm)
     # Further boards keep their pose relative to the planned one.
     boards = cell.z @ invert(recorded.edges[1]) @ recorded.edges[1:]

@@ -2,25 +2,36 @@
 
 A pick is that of the verdict (`calibration.stages.need`): the camera observes an object as a stop
 observes its target, and the robot goes there. Included are the errors of the camera's pose and the
-noise of the flange at the pick, and at the observation where the flange carries the camera. The
-error of detecting the object is not.
+noise of the flange at the pick, and at the observation where the flange carries the camera, and
+those of a lens that the stops determine. The error of detecting the object is not. Of a board that
+differs from its stated size by more than noise shows, the pick may be off by more; the plan gives
+the share from which the need is not met.
+
+A verdict judges by the noise that its own stops show. A plan counts as much as nine of ten sessions
+of so many stops show at most, so that these meet the need.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
+from visioncal.core.quantiles import chi2_limit, root_of
 from visioncal.core.tolerance_probability import chance_within
-from visioncal.core.transforms import adjoint, compose
+from visioncal.core.transforms import adjoint, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Need
+from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.planning.cell import PlanCell
-from visioncal.planning.information import World
+from visioncal.planning.information import RecordedStops, World, parameters_of, pick_jacobian
+from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions
+
+# Share of sessions that show more noise than a plan counts.
+_LARGER_NOISE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,29 +42,149 @@ class Picking:
     worlds: Sequence[World]  # The candidates' information in each of these.
     q: FloatArray  # (k, n) joint angles of the candidates [rad].
     need: Need  # Tolerance of the picks.
+    recorded: RecordedStops | None = None  # Stops that were recorded already.
 
-    def chance(self, rows: IntArray) -> float:
-        """Probability that a pick lands within tolerance, calibrated from (m,) candidates."""
+    @cached_property
+    def _sights(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Picks at some candidates in each cell, by the unknowns and by the robot's noise.
+
+        Each has an (m, 6, p) Jacobian, and (2, m, 6, 6) covariances by the levels of rotation and
+        position of this noise, at observation and pick.
+        """
+        q = self.q[np.linspace(0, len(self.q) - 1, min(40, len(self.q))).astype(np.int64)]
+        sights = []
+        for cell, world in zip(self.cells, self.worlds, strict=True):
+            size = len(world.prior)
+            jacobian = pick_jacobian(cell, q, self.recorded, size, estimates_lens=True)
+            # In the axes of what carries the camera: the flange, or the base.
+            levels = cell.noise.robots[0][:, None] ** 2 * np.repeat(np.eye(2), 3, axis=1)
+            covariances = np.tile((levels[:, None] * np.eye(6))[:, None], (1, len(q), 1, 1))
+            if cell.mount == "eye-in-hand":
+                middle = corner_positions(cell.target).mean(axis=0)
+                points = (cell.x @ cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
+                by_flange = adjoint(compose(np.eye(3), -points))
+                covariances += (by_flange * levels[:, None, None]) @ by_flange.mT
+            sights.append((jacobian, covariances))
+        return tuple(sights)
+
+    @cached_property
+    def _free(self) -> LensBoardParameters:
+        """Free parameters of lens and boards."""
+        return parameters_of(self.cells[0], self.recorded, estimates_lens=True)
+
+    @cached_property
+    def lens(self) -> IntArray:
+        """Columns of the lens."""
+        free = self._free
+        return 12 + np.flatnonzero(free.columns < len(intrinsics(free.appearance.camera)))
+
+    @cached_property
+    def boards(self) -> IntArray:
+        """Columns of the boards."""
+        return np.setdiff1d(12 + np.arange(len(self._free.columns)), self.lens)
+
+    @cached_property
+    def _held(self) -> IntArray:
+        """Columns of a stated size of the board, which a calibration holds."""
+        return self.boards[: 0 if self.recorded else None]
+
+    def chance(
+        self,
+        rows: IntArray,
+        *,
+        size_share: float | None = None,
+        known: IntArray | None = None,
+        is_exact: bool = False,
+    ) -> float:
+        """Probability that a pick lands within tolerance, calibrated from (m,) candidates.
+
+        Args:
+            rows: The candidates.
+            size_share: Share by which the board differs from its stated size; None where it differs
+                by no more than such stops show by chance.
+            known: Columns that would be known; None for none.
+            is_exact: Whether the robot would have no noise at observation and pick.
+        """
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
         shift_m = np.inf if self.need.mm is None else 1e-3 * self.need.mm
-        q = self.q[np.linspace(0, len(self.q) - 1, min(40, len(self.q))).astype(np.int64)]
+        freedom = self._freedom(rows)
+        # Of all noise, and of the robot's by level.
+        growth, *levels = chi2_limit(_LARGER_NOISE, freedom) / freedom
         chances = []
-        for cell, world in zip(self.cells, self.worlds, strict=True):
-            # Covariances of picks at the target are in the axes of what carries the camera: the
-            # flange, or the base; that of the camera's pose is of a right perturbation.
-            noise = np.repeat(cell.noise.robots[0], 3) ** 2
-            middle = corner_positions(cell.target).mean(axis=0)
-            points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
-            turn = cell.x[:3, :3]
-            # Poses at points move with the frame that these are in.
-            jacobian = block_diag(turn, turn) @ adjoint(compose(np.eye(3), -points))
-            covariances = jacobian @ world.covariance(rows)[:6, :6] @ np.swapaxes(jacobian, 1, 2)
-            covariances = covariances + np.diag(noise)
-            if cell.mount == "eye-in-hand":
-                by_flange = adjoint(compose(np.eye(3), -(points @ turn.T + cell.x[:3, 3])))
-                covariances += (by_flange * noise) @ np.swapaxes(by_flange, 1, 2)
-            chances.append(chance_within(covariances, turn_rad, shift_m))
+        for (jacobian, noise), world in zip(self._sights, self.worlds, strict=True):
+            covariance = world.covariance(rows)
+            by_size, own = covariance[:, self._held], np.diag(covariance)[self._held]
+            square = chi2_limit(_LARGER_NOISE, 1) * own if size_share is None else size_share**2
+            # A verdict counts what the stops show of a held size by chance: its square is one of
+            # a normal variable.
+            covariance = growth * covariance + (by_size * square / own**2) @ by_size.T
+            if known is not None and len(known):
+                cross = covariance[:, known]
+                covariance = covariance - cross @ np.linalg.solve(cross[known], cross.T)
+            covariances = jacobian @ covariance @ jacobian.mT
+            if not is_exact:
+                covariances += np.einsum("l,lmij->mij", levels, noise)
+            chances.append(chance_within(covariances, turn_rad, shift_m, float(freedom[-1])))
         return float(np.mean(chances))
+
+    def _freedom(self, rows: IntArray) -> FloatArray:
+        """(3,) degrees of freedom of all noise, and of the robot's levels of rotation and position.
+
+        A level that the corners' noise hides is estimated from few: these are twice the square of
+        its relative precision, by the Fisher information of its square.
+        """
+        so_far = 0 if self.recorded is None else self.recorded.stops
+        stops, share = len(rows) + so_far, (len(rows) + so_far) / max(len(rows), 1)
+        by_level = (stops - 2) / max(stops, 1) * share * self._known_levels[rows].sum(axis=0)
+        return np.maximum([6 * stops - 12, *by_level], 1.0)
+
+    @cached_property
+    def _known_levels(self) -> FloatArray:
+        """(k, 2) degrees of freedom that each candidate adds to the robot's levels of noise."""
+        cell, factors = self.cells[0], self.worlds[0].factors[:, :6]
+        # The carried edge moves with the flange.
+        edge, first = (cell.x, 0) if cell.mount == "eye-in-hand" else (cell.z, 6)
+        by_flange = factors[:, :, first : first + 6] @ adjoint(invert(edge))
+        noise = by_flange.reshape(-1, 6, 2, 3) * cell.noise.robots[0][:, None]
+        squares = np.einsum("kild,kjld->klij", noise, noise)
+        return np.asarray(np.sum(squares**2, axis=(2, 3)))
+
+    def condition(self, rows: IntArray) -> str:
+        """Condition on the board's size on which (m,) stops meet the need, in words.
+
+        It is empty where the board may differ by its stated sigma.
+        """
+        least = NeedLimits.probability[0]
+        if not len(self._held):
+            return ""
+        sigma = float(self.worlds[0].prior[self._held[0], self._held[0]] ** -0.5)
+        if self.chance(rows, size_share=sigma) >= least:
+            return ""
+        within = root_of(
+            *(lambda share: least - self.chance(rows, size_share=share), 0.0, sigma, 0.01 * sigma)
+        )
+        return (
+            f"as long as the board is as large as stated to {figure(100.0 * within)} %, which its "
+            "square_sigma_m does not promise: measure it over its whole width, and state square_m "
+            "and square_sigma_m"
+        )
+
+    def remedy(self, rows: IntArray) -> str:
+        """Remedy that raises the probability with (m,) stops most, in words, and to how much."""
+        by_words = {
+            'a lens that is known (matrix, distortion and intrinsics = "hold" in session.toml)': (
+                self.chance(rows, known=self.lens)
+            ),
+            "a board measured over its whole width (square_m and a smaller square_sigma_m)": (
+                self.chance(rows, known=self.boards)
+            ),
+            "a robot without noise at the pick": self.chance(rows, is_exact=True),
+        }
+        words, best = max(by_words.items(), key=lambda item: item[1])
+        if best < self.chance(rows) + 0.01:
+            return "a nearer camera or a larger board helps."
+        rest = "" if best >= NeedLimits.probability[0] else "; so does a nearer camera"
+        return f"{words} helps most, and would give {percent(best)}{rest}."
 
     def fewest(self, rows: IntArray) -> tuple[int, float]:
         """Least number of the first candidates that are enough, and the probability to reach.
@@ -82,6 +213,7 @@ class NeedPlanned:
     probability: float  # The same with them.
     best: float  # The same with all candidates.
     limits: str  # Its limit, in words; empty where the need is met.
+    condition: str = ""  # Condition on which the need is met, in words; empty where there is none.
 
     @property
     def met(self) -> bool:
@@ -101,10 +233,11 @@ def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
         words += f"More than {count} stops are needed: all candidates give {percent(best)}."
     elif words:
         words += (
-            f"All candidates together give {percent(best)}: a larger board or a nearer camera "
-            "helps, a square_sigma_m that is measured better, or less noise of the robot."
+            f"More stops cannot reach it: all candidates together give {percent(best)}. Of what "
+            f"can, {picking.remedy(every)}"
         )
-    return NeedPlanned(picking.need, picking.chance(rows[:0]), probability, best, words)
+    before, condition = picking.chance(rows[:0]), "" if words else picking.condition(rows)
+    return NeedPlanned(picking.need, before, probability, best, words, condition)
 
 
 def words_of(need: Need) -> str:

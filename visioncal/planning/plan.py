@@ -144,13 +144,18 @@ def make_plan(
     progress("information", 0, 1)
     cells = (cell, *cell.guesses(WORLDS - 1, request.seed))
     recorded = None if begun is None else begun.recorded
-    worlds = predict_worlds(cells, request.purpose, stops.q, recorded=recorded)
+    # A need is judged by the calibration, which determines the lens, too.
+    worlds = predict_worlds(
+        *(cells, request.purpose, stops.q),
+        recorded=recorded,
+        estimates_lens=request.need is not None,
+    )
     progress("choice", 0, 1)
     planning = _Planning(cells, request, stops, worlds, begun)
     design, route, in_the_way = planning.drivable_design(progress)
     need = None
     if request.need is not None:
-        picking = Picking(cells, worlds, stops.q, request.need)
+        picking = Picking(cells, worlds, stops.q, request.need, recorded)
         need = need_planned(picking, design.rows, request.count)
     return Plan(
         cell,
@@ -206,7 +211,8 @@ class _Planning:
         worlds = tuple(world.of_candidates(rows) for world in self.worlds)
         design = choose_stops(worlds, request.count, request.criterion)
         if request.need is not None:
-            picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
+            so_far = None if self.begun is None else self.begun.recorded
+            picking = Picking(self.cells, worlds, self.found.q[rows], request.need, so_far)
             fewest, share = picking.fewest(design.rows)
             if fewest == 0 and needed_stops <= 0:
                 chance = percent(picking.chance(design.rows[:0]))

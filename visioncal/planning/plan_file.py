@@ -91,6 +91,8 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         }
         if need.limits:
             document["shortfall"] = need.limits
+        if need.condition:
+            document["condition"] = need.condition
     if plan.in_the_way:
         document["exchanged_because_of"] = list(plan.in_the_way)
     return document
