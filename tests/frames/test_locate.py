@@ -406,7 +406,9 @@ def test_one_image_needs_a_target_and_a_pose(cell, tmp_path):
     assert "--target names another" in run("locate", **board).err
     other = wanted | {"target": "aprilgrid_6x4_32mm"}
     refused(r"shot\.png: target aprilgrid", "locate", **other, pose=pose)
-    if pose is not None:
+    if pose is None:
+        refused("--pose: the camera is fixed", "locate", **wanted, pose="0,0,0,0,0,0,1")
+    else:
         assert "--pose" in refused("robot's pose at the image is missing", "locate", **wanted)
 
 
@@ -540,6 +542,10 @@ def test_the_tip_comes_as_near_as_predicted(proved, located):
     assert evaluate_gaps(points, away_mm).passed
     assert not evaluate_gaps(points, [5.0] * 5).passed
     raised(DataError, "5 of 0 mm or more", evaluate_gaps, points, [0.1])
+    metres = [2e-4, 0.0, 5e-3, 0.0, 0.0]
+    in_metres = raised(DataError, "in metres, most likely", evaluate_gaps, points, metres)
+    assert "--gaps-mm 0.2,0,5,0,0" in in_metres.next_step
+    assert evaluate_gaps(points, [0.0] * 5).passed
 
 
 def test_no_target_brings_what_the_flange_carries_into_the_board(proved, known):

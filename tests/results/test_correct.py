@@ -357,7 +357,7 @@ def test_ways_through_singular_postures_are_found(stored, result):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{POSE}\n400,100,200,0,1,0,0\n", "Positions are in metres"),
+        ("{POSE}\n400,100,200,0,1,0,0\n", "t.csv, line 2: these are millimetres, most likely"),
         ("x_m,y_m,z_m,qx,qy,qz\n0.4,0.1,0.2,0,1,0\n", "qw are missing"),
         ("x_m,y_m,z_m,qx,qy,qz,q4\n0.4,0.1,0.2,0,0.6,0,0\n", "qw are missing"),
         ("{POSE}\n0.4,0.1,,0,0,0,1\n", "column z_m: it is empty"),

@@ -17,7 +17,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.parsing import FORMS, POSE, numbers_in, refuse_given
-from visioncal.core.types import FloatArray, Target
+from visioncal.core.types import FloatArray, Mount, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
 from visioncal.frames.locate import (
     cloud_in_base,
@@ -67,7 +67,7 @@ def locate_command(options: LocateOptions) -> None:
     else:
         refuse_given({"--view": options.view}, "only a session has views")
     form = controller_form("", options.robot_form) or calibrated.controller()
-    flange, joints_rad = None if options.pose is None else _flange(options.pose, form), None
+    flange, joints_rad = _flange(options.pose, form, calibrated.mount), None
     if options.pixel or options.cloud is not None:
         if session is not None:
             flange, joints_rad = _flange_of(session, _chosen(session, options.view), calibrated)
@@ -204,11 +204,17 @@ def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
     return chosen
 
 
-def _flange(words: str, form: PoseForm | None) -> FloatArray:
-    """Reads a pose of the robot, (4, 4) `base_from_flange` [m]."""
+def _flange(words: str | None, form: PoseForm | None, mount: Mount) -> FloatArray | None:
+    """Reads a pose of the robot, (4, 4) `base_from_flange` [m]; None where none is given."""
+    if words is None:
+        return None
     if words.count(",") != POSE.count(",") or is_marked_pose(words):
-        return read_pose(words, "--pose", None if form is None else form.name).pose
-    return stated_pose(numbers_in(words, "--pose", POSE), "--pose")
+        pose = read_pose(words, "--pose", None if form is None else form.name).pose
+    else:
+        pose = stated_pose(numbers_in(words, "--pose", POSE), "--pose")
+    if mount == "eye-to-hand":
+        refuse_given({"--pose": words}, "the camera is fixed, wherever the robot is")
+    return pose
 
 
 def _flange_of(

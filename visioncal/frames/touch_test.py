@@ -24,6 +24,9 @@ from visioncal.robot.collision import camera_body
 from visioncal.session import Session
 from visioncal.vision.targets import corner_positions
 
+# Reading error of a gap, by a feeler gauge or by eye over a tip, and the least that is read [mm].
+_READ_MM, _LEAST_READ_MM = 0.1, 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class TouchPoint:
@@ -127,9 +130,8 @@ def touch_targets(
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
         covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
-        # Reading error of a gap, by a feeler gauge or by eye over a tip [mm]. Rounded up: no gap as
-        # large as the limit that was told exceeds it.
-        radius_mm = rounded_up(float(np.hypot(1e3 * radius95(covariance), 0.1)))
+        # Rounded up: no gap as large as the limit that was told exceeds it.
+        radius_mm = rounded_up(float(np.hypot(1e3 * radius95(covariance), _READ_MM)))
         points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
     return TouchTargets(tuple(points), frame)
 
@@ -149,6 +151,14 @@ def evaluate_gaps(
             culprits=["--gaps-mm"],
             next_step="Give them in the order of the points, without sign (149.9 mm beside a block "
             "of 150 mm are 0.1), as --gaps-mm 0.2,0.1,0.3,0.2,0.2.",
+        )
+    if 0.0 < max(gaps_mm) < _LEAST_READ_MM:
+        raise DataError(
+            f"touch-test: the gaps are in metres, most likely: the largest is {max(gaps_mm):g} mm, "
+            f"and a tip over a point is read to {_LEAST_READ_MM:g} mm at best.",
+            culprits=["--gaps-mm"],
+            next_step="Give millimetres: --gaps-mm "
+            f"{','.join(f'{1e3 * gap:g}' for gap in gaps_mm)}. A gap that cannot be seen is 0.",
         )
     touched = tuple(
         TouchedPoint(

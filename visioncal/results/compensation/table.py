@@ -1,8 +1,9 @@
 """Tables of targets: read with the columns of views.csv, and written with the corrections."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,6 +13,7 @@ from visioncal.core.documents.columns import Column, TableReader
 from visioncal.core.documents.pendants import rotation_names
 from visioncal.core.documents.tables import TextTable, csv_text, read_table
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
@@ -92,8 +94,28 @@ def read_targets(
         return Targets(table, places, typed[1].poses(), seeds, names, typed[1].reading)
     reader.unit(QUATERNION)
     reader.check()
+    _check_metres(path, poses[:, :3], places, columns)
     rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
     return Targets(table, places, compose(rotations, poses[:, :3]), seeds, POSE, Reading())
+
+
+def _check_metres(
+    path: Path, positions: FloatArray, places: Sequence[str], columns: Sequence[str]
+) -> None:
+    """Refuses positions (m, 3) beyond any arm's reach; raises DataError."""
+    extents_m = np.abs(positions).max(axis=1, initial=0.0)
+    far = np.flatnonzero(extents_m >= FAR_M).tolist()
+    if not far:
+        return
+    fields = "; ".join(f"${list(columns).index(name) + 1} /= 1000" for name in POSE[:3])
+    metres = path.with_name(f"{path.stem}_m.csv")
+    raise DataError(
+        f"{places[far[0]]}: these are millimetres, most likely: its position is "
+        f"{extents_m[far[0]]:.4g} m from the base, and no arm reaches {FAR_M:g} m.",
+        culprits=[places[row] for row in far],
+        next_step=f"Positions are in metres: awk -F, -v OFS=, 'NR > 1 {{ {fields} }} 1' "
+        f"{quote(str(path))} > {quote(str(metres))}, and correct those.",
+    )
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
