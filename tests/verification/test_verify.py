@@ -303,6 +303,15 @@ def test_a_board_that_was_placed_anew_is_no_fault(place):
     assert names(slipped) == ["joint 3"]
 
 
+def test_a_small_shift_without_a_turn_is_the_cameras_and_no_growth_of_lens_or_arm(place):
+    rng = np.random.default_rng(8)
+    found = [checked(place, rng, Change(camera=knock(rng, 0.5, 0.0)), stops=6) for _ in range(4)]
+    likeliest = [value.compared[0] for value in found]
+    assert [change.name for change in likeliest] == 4 * ["camera"]
+    # The verdict then says over 99 %.
+    assert min(change.probability for change in likeliest) > 0.99
+
+
 def test_changes_that_no_stop_separates_are_named_together(place):
     rng = np.random.default_rng(3)
     # A slip of the first joint turns all that stands in the base; of the last, what is carried.

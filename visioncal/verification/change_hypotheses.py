@@ -1,6 +1,6 @@
 """Hypotheses on what changed in a cell since its calibration, which a check compares."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +30,14 @@ CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LOAD, LENGTH, NOISE, VIEW, PAI
     "view",
     "pairing",
 )
+# Prior chances of kinds, relative to a camera or board that is knocked: a lens is focused again, or
+# a board printed anew, on purpose. Two changes at once are rarer, and so is an arm that is warmer
+# by as much as stops show.
+_CHANCES = {LENS: 0.1, SIZE: 0.3, REPLACED: 0.3, BOTH: 0.1, LENGTH: 0.03}
+# Shares by which a lens that is focused again, and an arm that is warmer by up to 50 K, grow.
+_FOCUS_SHARES, _WARMTH_SHARES = (1e-3, 1e-2, 1e-1), (1e-4, 3e-4, 1e-3)
+# A mount that is knocked turns with its shift, or slides and turns a tenth as far.
+_KNOCKS = (np.ones(6), np.repeat([0.1, 1.0], 3))
 # Two simultaneous changes.
 PAIRS = (BOTH, REPLACED)
 # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
@@ -61,7 +69,7 @@ def causes_of(
     moved = adjoint(invert(measured))
     # Steps from zero do not reach half a turn, and logarithms near it have no mean.
     undoing = log(mean_transform(measured @ invert(away) @ invert(measured)))
-    camera = ChangeHypothesis(CAMERA, MOTION_UNITS, moved, start=undoing)
+    camera = ChangeHypothesis(CAMERA, MOTION_UNITS, moved, start=undoing, shapes=_KNOCKS)
     # A board that is larger by a share is seen nearer by the same share.
     nearer = np.zeros((len(measured), 6, 1))
     nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
@@ -78,7 +86,7 @@ def causes_of(
         # The board's edge: a twist on its right.
         by_place = np.where(shown[:, None, None], -np.eye(6), 0.0)
         start, name = log(mean_transform(away[shown])), f"{BOARD} {names[index]}".strip()
-        place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at)
+        place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at, shapes=_KNOCKS)
         other = replace(size, units=np.array([_OTHER_SIZE_PER_M]))
         causes += [place, _simultaneous(REPLACED, place, other)]
         # Camera and board together fit any two stops.
@@ -88,7 +96,9 @@ def causes_of(
     ((_, poses),) = predicted.problem.poses.items()
     farther = np.zeros((len(poses), 6, 1))
     farther[:, 3:, 0] = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    causes.append(ChangeHypothesis(LENGTH, np.ones(1), flange_jacobian=farther))
+    causes.append(
+        ChangeHypothesis(LENGTH, np.ones(1), flange_jacobian=farther, sizes_m=_WARMTH_SHARES)
+    )
     causes += _joints(predicted, prior)
     if predicted.stops > 1:
         # The robot's noise may have grown by 2 to 32 times.
@@ -96,6 +106,13 @@ def causes_of(
         causes.append(ChangeHypothesis(NOISE, np.zeros(0), noise_factors=factors))
         causes += [*_views(predicted, prior, changes), *_pairing(predicted, prior, changes)]
     return tuple(causes)
+
+
+def prior_chances(causes: Sequence[ChangeHypothesis]) -> FloatArray:
+    """(c,) prior probabilities of changes; those of one kind share its chance."""
+    kinds = [cause.kind for cause in causes]
+    chances = np.array([_CHANCES.get(kind, 1.0) / kinds.count(kind) for kind in kinds])
+    return np.asarray(chances / chances.sum())
 
 
 def _focal_length(predicted: PredictedStops, changes: FloatArray) -> Iterator[ChangeHypothesis]:
@@ -119,7 +136,9 @@ def _focal_length(predicted: PredictedStops, changes: FloatArray) -> Iterator[Ch
     is_small = not _SMALL_SHARE < abs(share) < _LARGE_SHARE
     # Large ones bend.
     by_share, share = (small, 0.0) if is_small else (undoing(share), share)
-    yield ChangeHypothesis(LENS, np.ones(1), by_share, start=np.array([share]))
+    yield ChangeHypothesis(
+        LENS, np.ones(1), by_share, start=np.array([share]), sizes_m=_FOCUS_SHARES
+    )
 
 
 def _simultaneous(kind: str, one: ChangeHypothesis, other: ChangeHypothesis) -> ChangeHypothesis:

@@ -20,7 +20,14 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
 from visioncal.verification.calibration_prior import CalibrationPrior
-from visioncal.verification.change_hypotheses import CAMERA, LENGTH, NOISE, PAIRS, causes_of
+from visioncal.verification.change_hypotheses import (
+    CAMERA,
+    LENGTH,
+    NOISE,
+    PAIRS,
+    causes_of,
+    prior_chances,
+)
 from visioncal.verification.misreading import misreading
 from visioncal.verification.model_evidence import (
     ChangeHypothesis,
@@ -187,10 +194,8 @@ def check(
     with one_blas_thread():
         unchanged = evidence_of(problem, belief)
         explanations = [evidence_of(problem, belief, cause) for cause in causes]
-    # Kinds of causes have equal prior probabilities, and causes of one kind.
-    kinds = [cause.kind for cause in causes]
-    priors = np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
-    scores = np.array([explained.likelihood for explained in explanations]) + np.log(priors)
+    likelihoods = np.array([explained.likelihood for explained in explanations])
+    scores = likelihoods + np.log(prior_chances(causes))
     evidence = float(np.logaddexp.reduce(scores))
     compared = tuple(
         PossibleChange(causes[index], float(np.exp(scores[index] - evidence)), explanations[index])

@@ -78,6 +78,10 @@ class ChangeHypothesis:
     # Factors on the noise of the stops, where larger noise is the change.
     noise_factors: tuple[float, ...] = (1.0,)
     at: int = 0  # Index of the board or joint.
+    # Sizes with equal prior probability, for a change of one metre.
+    sizes_m: tuple[float, ...] = SIZES_M
+    # (p,) factors on the units, of equally likely shapes of the change; none for the units alone.
+    shapes: tuple[FloatArray, ...] = ()
     # Views whose images belong to the poses of others, and these.
     pairs: tuple[tuple[int, int], ...] = ()
 
@@ -112,7 +116,8 @@ def evidence_of(
     log_priors = -0.5 * (np.log(new_m / _REPEATABILITY_M) / np.log(_FACTOR)) ** 2
     log_priors -= np.logaddexp.reduce(log_priors) + np.log(len(cause.noise_factors))
     prior_of = dict(zip(shares, log_priors.tolist(), strict=True))
-    sizes_m, widest = SIZES_M if len(cause.units) else SIZES_M[:1], SIZES_M[-1] * cause.units
+    sizes_m = cause.sizes_m if len(cause.units) else cause.sizes_m[:1]
+    widest, shapes = SIZES_M[-1] * cause.units, cause.shapes or (np.ones(len(cause.units)),)
     values = np.zeros(len(cause.units)) if cause.start is None else cause.start
     for _ in range(6):
         trials = tuple(product(cause.noise_factors, shares))
@@ -125,8 +130,8 @@ def evidence_of(
         if np.abs(values - before).max(initial=0.0) < _CONVERGED:
             break
     scores = [
-        variant.score(size_m * cause.units, belief.freedom) + prior_of[share]
-        for ((_, share), variant), size_m in product(variants.items(), sizes_m)
+        variant.score(size_m * shape * cause.units, belief.freedom) + prior_of[share]
+        for ((_, share), variant), size_m, shape in product(variants.items(), sizes_m, shapes)
     ]
     # With the widest prior on the change's size, which hardly shrinks it.
     mean, covariance = variants[likeliest].posterior(widest)
@@ -134,7 +139,7 @@ def evidence_of(
     remaining = white.residuals + white.jacobian @ mean
     misfit = float(remaining @ remaining)
     return HypothesisEvidence(
-        float(np.logaddexp.reduce(scores) - np.log(len(sizes_m))),
+        float(np.logaddexp.reduce(scores) - np.log(len(sizes_m) * len(shapes))),
         mean,
         covariance,
         -covariance @ white.jacobian.T @ white.by_unknowns,
