@@ -13,6 +13,7 @@ from support.refusals import raised
 
 import visioncal
 from visioncal.core.errors import DegenerateError
+from visioncal.core.number_format import ranges
 from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
 from visioncal.session.columns import POSE
@@ -63,7 +64,7 @@ def with_tool(folder: Path, is_active):
 
     def change(rows: Rows) -> Rows:
         for row in rows:
-            if is_active(int(row["stop"])):
+            if row["robot"] == "a" and row["x_m"] and is_active(int(row["stop"])):
                 numbers = np.array([float(row[name]) for name in POSE])
                 turn = Rotation.from_quat(numbers[3:])
                 place = numbers[:3] + turn.apply([0.01, 0.02, 0.15])
@@ -138,6 +139,49 @@ def test_a_board_in_hand_moves_with_the_tool_that_was_switched(tmp_path, monkeyp
         "the controller's tool is another one from stop 12 on, by (10, 20, 150) mm" in cause.words
     )
     mended(cell)
+
+
+@pytest.mark.parametrize("has_stops", [True, False])
+@pytest.mark.parametrize("first", [8, 12])
+def test_the_tool_of_one_of_two_robots_is_taken_off_its_rows_alone(
+    tmp_path, monkeypatch, first, has_stops
+):
+    """One camera may see most of its views before the switch, and the other one after it."""
+    monkeypatch.chdir(tmp_path)
+    cell_session(simulate(NetworkOptions(stops=20, seed=3)), "cell", seen="corners").save(
+        tmp_path / "cell"
+    )
+    with_tool(tmp_path / "cell", lambda stop: stop >= first)
+    late, early = list[int](), list[int]()
+
+    def change(rows: Rows) -> Rows:
+        for row in rows:
+            if row["robot"] == "a" and row["x_m"]:
+                (late if int(row["stop"]) >= first else early).append(int(row["view"]))
+        kept = [name for name in rows[0] if not name.endswith("_rad")]
+        kept = [name for name in kept if has_stops or name != "stop"]
+        return [{name: row[name] for name in kept} for row in rows]
+
+    edit_rows(tmp_path / "cell", change)
+    found = visioncal.calibrate("cell").verdict.causes[0]
+    assert "the controller's tool" in found.words
+    # The tool off the later poses, or its inverse off the earlier ones.
+    views = re.search(r"--without-tool (\S+?):", found.do.command)[1]
+    assert views in (ranges(late), ranges(early))
+    followed = follow("calibrate", "cell", "-o", "out")
+    words = [*followed.words]
+    assert Calibration.load(words[words.index("-o") + 1]).verdict.status == "good"
+
+
+def test_a_pair_that_has_no_answer_does_not_cost_the_cells(tmp_path, monkeypatch):
+    stereo(tmp_path / "cell")
+    with_tool(tmp_path / "cell", lambda stop: stop >= MIDWAY)
+
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr("visioncal.calibration.run._of_pair", singular)
+    assert visioncal.calibrate(tmp_path / "cell").verdict.status == "check"
 
 
 def test_corners_of_one_camera_that_are_numbered_from_the_other_end(tmp_path, monkeypatch):

@@ -518,3 +518,33 @@ def test_a_shared_column_that_names_two_cameras_is_refused(folder):
     edit(folder, "views.csv", "note", "camera")
     edit(folder, "views.csv", "0.8,", "0.8,left")
     assert "names first, " in refusal(folder).message
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ({"matrix": None, "matrix_sigma_px": None}, ""),
+        ({1: 2}, ""),
+        ({"matrix_sigma_px": 10**400}, "matrix_sigma_px is 1000.*, but must be a number"),
+    ],
+)
+def test_a_camera_of_a_mapping_may_leave_values_out(camera, words):
+    corners = [([0, 1], [[1.0, 2.0], [3.0, 4.0]])] * 3
+    poses = np.tile(np.eye(4), (3, 1, 1))
+
+    def build() -> Session:
+        return Session.from_corners(
+            corners, poses, "charuco_9x6_30mm", (1280, 800), mount=np.str_("eye-in-hand"),
+            camera={"resolution": (1280, 800), **camera},
+        )  # fmt: skip
+
+    if words:
+        raised(DataError, words, build)
+    else:
+        assert build().mount == "eye-in-hand"
+
+
+def test_a_schema_as_a_text_is_refused_in_words(folder):
+    path = folder / "session.toml"
+    path.write_text(path.read_text("utf-8").replace("schema = 1", 'schema = "1"'), "utf-8")
+    raised(DataError, "schema is '1', but must be 1", Session.load, folder)

@@ -208,6 +208,12 @@ from_stop = 4
         ("[instruments.tracker]", "[cameras.b]", "own.toml: there are points and no instrument"),
         ("place_m = [2.0, 0.0, 0.3]", "", "own.toml: instruments.tracker.place_m is missing"),
         ("[2.0, 0.0, 0.3]", "[nan, 0.0, 0.3]", r"place_m\[0\] is nan, but must be a finite"),
+        ("[cameras.top]", '[cameras.top]\nname = "x"', "cameras.top.name is not known"),
+        (
+            "place_m = [-0.7, 0.0, 0.0]",
+            "place_m = [-0.7, 0.0, 0.0]\nbacklash_rad = [nan]",
+            r"backlash_rad\[0\] is nan, but must be a finite",
+        ),
         ("from_stop = 4", "from_stop = 6", "target_plate is pushed before stop 6; of 6 stops"),
         ('robot = "a"', 'robot = "b"', "a sweep is of robot 'b'; there are a"),
         ('camera = "top"', 'camera = "left"', "a sweep is of camera 'left'; there are top"),

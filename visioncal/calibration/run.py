@@ -222,7 +222,8 @@ def _explained_by_pairs(error: VisioncalError, state: RunState) -> VisioncalErro
     """The error of a whole cell with the first cause that a pair of it shows alone."""
     every = [] if state.mount is not None else pairs_alone(state, partial(_of_pair, state))
     for found in found_alone(state, every):
-        return type(error)(found.words, next_step=str(found.do or ""))
+        culprits = [f"view {view}" for view in found.views] or error.culprits
+        return type(error)(found.words, culprits=culprits, next_step=str(found.do or ""))
     return error
 
 

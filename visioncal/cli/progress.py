@@ -24,6 +24,7 @@ WORDS = {
     "arms": "fit the arms, and look again for outliers and moves",
     "examine": "leave views out and predict them",
     "judge": "judge the result",
+    "pairs": "calibrate each camera and robot of the cell alone",
     "write": "write the result, report and recording",
     "batch": "calibrate the sessions",
     "render": "render the images",

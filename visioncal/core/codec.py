@@ -264,9 +264,7 @@ def read_value(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what 
     if origin in (Union, UnionType):
         return read_value(_fitting(_alternatives(kind), value), value, path)
     if origin is Literal:
-        if not any(value == each for each in args if type(value) is type(each)):
-            raise wrong_value(value, needed_of(kind), path, _similar(value, args))
-        return value
+        return _one_of(args, value, kind, path)
     if origin is tuple:
         return _read_tuple(kind, value, path)
     if origin is not None and issubclass(origin, Mapping):
@@ -275,6 +273,15 @@ def read_value(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what 
     if is_dataclass(kind):
         return read(kind, value, path)  # type: ignore[arg-type] # no instance, but a class
     return plain(kind, value, path)
+
+
+def _one_of(names: Sequence[Any], value: object, kind: Any, path: str) -> Any:  # noqa: ANN401
+    """The name that a value is: `True` is no 1, and a text of another class is a text."""
+    for name in names:
+        is_same_kind = isinstance(value, bool) == isinstance(name, bool)
+        if is_same_kind and isinstance(value, type(name)) and value == name:
+            return name
+    raise wrong_value(value, needed_of(kind), path, _similar(value, names))
 
 
 def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see `read_value`
@@ -299,6 +306,10 @@ def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see
 def _read_by_name(kind: Any, value: Any, path: str) -> tuple[Any, ...]:  # noqa: ANN401
     if not all(isinstance(each, Mapping) for each in (value, *getattr(value, "values", tuple)())):
         raise wrong_value(value, f"tables [{path}.NAME]", path)
+    named = next((_joined(path, name) for name, row in value.items() if "name" in row), None)
+    if named is not None:
+        words = f"{named}.name is not known: the table has the name."
+        raise DataError(words, culprits=[f"{named}.name"])
     rows = ((name, {**row, "name": name}) for name, row in value.items())
     return tuple(read_value(kind, row, _joined(path, name)) for name, row in rows)
 
@@ -385,11 +396,15 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
         raise wrong_value(value, needed_of(kind), path)
-    return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
+    try:
+        return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
+    except OverflowError as error:
+        raise wrong_value(value, needed_of(kind), path) from error
 
 
 def _similar(value: object, names: Collection[Any]) -> str:
-    return did_you_mean(value, names) if isinstance(value, str) else ""
+    texts = [name for name in names if isinstance(name, str)]
+    return did_you_mean(value, texts) if isinstance(value, str) else ""
 
 
 def wrong_value(value: object, needed: str, path: str, next_step: str = "") -> DataError:

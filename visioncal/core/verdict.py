@@ -36,7 +36,6 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
-# Options of `convert` that change all robots or cameras.
 _BY_HAND = "Of several robots or cameras, correct the files by hand."
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"

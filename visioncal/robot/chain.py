@@ -208,7 +208,10 @@ def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
     size = len(given[0]) if isinstance(given[0], Sequence) else 0
     words = Check(f"{size} pairs of numbers, sine and cosine of the orders from 2 on [rad]")
     kind = Annotated[FloatArray, words, Array((size, 2))]
-    return np.array([row.read("harmonics", kind) for row in rows])
+    harmonics = np.array([row.read("harmonics", kind) for row in rows])
+    if not np.isfinite(harmonics).all():
+        raise rows[0].refuse("harmonics", given[0], "finite numbers [rad]")
+    return harmonics
 
 
 def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:

@@ -140,7 +140,11 @@ def _content(
         "schema": 1,
         "name": cell.get("name", "session"),
         "mount": cell.get("mount", "eye-in-hand"),
-        "camera": {name: np.asarray(value).tolist() for name, value in camera.items()},
+        "camera": {
+            str(name): np.asarray(value).tolist()
+            for name, value in camera.items()
+            if value is not None
+        },
     }
     document["target"] = "target.toml" if isinstance(board, Target) else board
     transforms = RigidTransform.from_matrix(matrices)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.choices import SIMULATED_ARMS
-from visioncal.core.codec import NotNegative, Strict
+from visioncal.core.codec import Finite, NotNegative, Strict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import known_name
 from visioncal.core.transforms import cross, exp
@@ -103,9 +103,9 @@ class Payload(Strict):
 
     kg: NotNegative = 0.0  # Mass [kg].
     # Centre of mass in the flange frame [m].
-    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     # Force on the flange's origin, in the base frame [N].
-    force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    force_n: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
 
     def row(self) -> dict[str, float]:
         """Values of a session's payload columns."""
@@ -134,13 +134,13 @@ class ArmOptions:
     robot_sigma_m: NotNegative = 3e-5  # Repeatability of the flange's position, per axis [m].
     robot_sigma_rad: NotNegative = 5e-5  # Repeatability of its rotation, per axis [rad].
     # Compliance of each joint; empty for a rigid arm.
-    compliance_rad_per_nm: tuple[float, ...] = ()
+    compliance_rad_per_nm: tuple[NotNegative, ...] = ()
     payloads: tuple[Payload, ...] = ()  # Payloads, cycled over the stops; empty for none.
     # Whether the controller compensates what the arm's own weight bends: only loads show then.
     weight_compensated: bool = False
     # Backlash of each joint; empty for none. With backlash, stops are approached from alternating
     # sides.
-    backlash_rad: tuple[float, ...] = ()
+    backlash_rad: tuple[Finite, ...] = ()
 
     @property
     def sigma(self) -> FloatArray:

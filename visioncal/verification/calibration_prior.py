@@ -160,7 +160,9 @@ class CalibrationPrior:
 def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     names, stops = fit.boards, fit.stops
     x_name, z_name = edge_names(calibration.mount)
-    edges = (x_name, *(f"{z_name}_{name}" if name else z_name for name in names))
+    # The only board may have a name in the session, and so in its transform.
+    lone = next((name for name in calibration.edges if name != x_name), z_name)
+    edges = (x_name, *(f"{z_name}_{name}" if name else lone for name in names))
     targets = {
         name: target_from_document(target, name or "target") for name, target in fit.targets.items()
     }

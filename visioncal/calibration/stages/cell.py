@@ -69,9 +69,7 @@ class Cell:
             if robot_key(name) == robot
             for view in rows_of_robot(self.session, name)
         )
-        return [
-            view.number for view in own if (view.number if view.stop is None else view.stop) >= stop
-        ]
+        return [view.number for view in own if stop_of(view) >= stop]
 
     def or_separately(self, do: str, station: int, note: str = "") -> Remedy:
         """Advice to `do` something and record again, or to calibrate what follows it alone.
@@ -201,6 +199,11 @@ def pair_edges(session: Session) -> tuple[str, ...]:
     boards = tuple(session.targets) or ("",)
     parent = target.partition("_from_")[0]
     return (camera, *(f"{parent}_from_{frame_name('target', board)}" for board in boards))
+
+
+def stop_of(view: View) -> int:
+    """Number of a row's stop: its own where the table has no stops."""
+    return view.number if view.stop is None else view.stop
 
 
 def rows_of_robot(session: Session, robot: str) -> list[View]:

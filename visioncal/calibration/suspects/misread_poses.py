@@ -23,7 +23,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import exchanged_columns
-from visioncal.calibration.stages.cell import rows_of_robot
+from visioncal.calibration.stages.cell import rows_of_robot, stop_of
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -164,14 +164,12 @@ def with_undone(run: RunState) -> RunState:
 
 
 def _stops_of(run: RunState, robot: str) -> dict[int, StopOfRobot]:
-    """The stops of a robot of a cell, in the order of its rows; none where a row has no stop."""
+    """The stops of a robot of a cell, in the order of its rows."""
     found = dict[int, StopOfRobot]()
     by_view = run.robots[robot].base_from_flange if robot in run.robots else {}
     for view in rows_of_robot(run.session, robot):
-        if view.stop is None:
-            return {}
         if view.number in by_view:
-            found.setdefault(view.stop, StopOfRobot(view.number, by_view[view.number]))
+            found.setdefault(stop_of(view), StopOfRobot(view.number, by_view[view.number]))
     return found
 
 

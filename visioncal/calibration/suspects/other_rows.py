@@ -61,7 +61,12 @@ def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
     first = declared[0]
     odds = EVIDENCE * (best.log_likelihood - first.log_likelihood)
     odds -= np.log(len(choices) * len(_SHIFTS))
-    if not best.closes or odds < 2.0 * CLEAR or CLEAR_RATIO * best.score > beside:
+    # Moved, rows at an end have no other one: the rest may agree without them, as switched frames
+    # leave it, and no nearer in what was moved.
+    sides = [side for side, some in enumerate(("xyz", "R")) if {*some} & {*parts}]
+    is_nearer = all(CLEAR_RATIO * best.rms[side] < first.rms[side] for side in sides)
+    is_clear = best.closes and odds >= 2.0 * CLEAR and CLEAR_RATIO * best.score <= beside
+    if not is_clear or not is_nearer:
         return
     names, apart = listed([_NAMES[part] for part in parts]), counted(abs(by), "row")
     stand, where = ("later", "up") if by > 0 else ("earlier", "down")

@@ -9,18 +9,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.recording import FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import of_pair
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cell import rows_of_robot
+from visioncal.calibration.stages.cell import rows_of_robot, stop_of
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
-from visioncal.calibration.suspects.moved_views import KNOCKED
-from visioncal.calibration.suspects.suspect import UNEXPLAINED, Suspect
+from visioncal.calibration.suspects.moved_views import KNOCKED, other_frame
+from visioncal.calibration.suspects.suspect import SOURCES, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import mm_and_deg, ranges, robot_words, some_of
-from visioncal.core.transforms import invert, log, pose_difference
+from visioncal.core.number_format import mm_and_deg, ranges, robot_words, some_of, view_words
+from visioncal.core.transforms import compose, invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import Finding, Remedy, mending, or_alone
 from visioncal.estimation.unknowns import EDGE
@@ -36,10 +37,13 @@ _MOST_PAIRS = 8
 _OPEN = ("", UNEXPLAINED, "wrong_views", "lost_views", "moved_frame")
 # Kinds of causes that a cell's own fit does not find. Those of a robot are in all of its pairs.
 _OF_ROBOT, _OF_CAMERA = ("something_moved", "late_poses"), ("other_lens", "image_sizes", "lens")
+# Causes of a pair whose views agree.
+_SIZES = (*SOURCES, "few_stops", "too_few_stops", "place", "weak_motion")
 # Frames by two pairs that are further apart than so many sigmas, and than an arm errs, are others.
 _SIGMAS = 6.0
-# Views whose poses or images an option changes.
-_ON_VIEWS = re.compile(r"--(shift|positions|without-tool) ([\d,-]+):")
+# Views whose poses or images an option changes, and the tool that one takes off.
+_ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):")
+_TOOL = re.compile(r"--without-tool [\d,-]+:(\S+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +92,17 @@ def pairs_alone(run: RunState, calibrated: PairRun) -> list[PairAlone]:
     ]
     every.sort(key=lambda item: -len(item[1].poses))
     found = list[PairAlone]()
-    for robot, pair in every[:_MOST_PAIRS] if len(every) > 1 else ():
+    for at, (robot, pair) in enumerate(every[:_MOST_PAIRS] if len(every) > 1 else ()):
+        if run.progress is not None:
+            run.progress("pairs", at, min(len(every), _MOST_PAIRS))
         alone = of_pair(run, robot, pair)
         corners = {
             view: seen for look in alone.cameras.values() for view, seen in look.corners.items()
         }
         try:
             answer = calibrated(alone.session, corners)
-        except VisioncalError:
-            # Another pair may show why.
+        except (VisioncalError, ValueError, ArithmeticError):
+            # Another pair may show why, and the cell's own answer stands; singular matrices, too.
             continue
         found.append(PairAlone(robot, pair, answer))
     return found
@@ -111,25 +117,79 @@ def found_alone(run: RunState, every: Sequence[PairAlone]) -> Iterator[Finding]:
             verdict = one.answer.verdict
             for cause in () if verdict is None else verdict.causes[:2]:
                 causes.setdefault(cause.kind, []).append((one, cause))
-        for kind in _OF_ROBOT:
-            # Of one camera alone, the camera itself was moved, as the cell's own fit says.
-            if kind in causes and len(causes[kind]) == len(of_robot):
-                yield _of_robot(run, robot, causes[kind])
+        # Of one camera alone, the camera itself was moved, as the cell's own fit says.
+        shared = [kind for kind in _OF_ROBOT if len(causes.get(kind, ())) == len(of_robot) > 0]
+        for kind in shared:
+            tool = _tool_switched(run, robot, causes[kind]) if kind == "something_moved" else None
+            if tool is not None or kind != "something_moved":
+                yield tool or causes[kind][0][1].of(robot_words(robot))
         for kind in _OF_CAMERA:
             for one, cause in causes.get(kind, ()):
                 yield cause.of("" if len(run.session.cameras) < 2 else one.pair.camera)
-        yield from _contradictions(run, of_robot)
+        if not shared:
+            yield from _contradictions(run, of_robot)
 
 
-def _of_robot(run: RunState, robot: str, found: Sequence[tuple[PairAlone, Finding]]) -> Finding:
-    """A cause that all pairs of a robot show, with the views of all."""
-    cause, views = found[0][1], sorted({view for _, each in found for view in each.views})
-    whose = robot_words(robot)
-    words = f"{whose[0].upper()}{whose[1:]}, in its rows of {found[0][0].words}"
-    if len(found) > 1:
-        words += f", and alike of {some_of([one.words for one, _ in found[1:]])}"
-    cause = replace(cause, words=f"{words}: {cause.words}", views=tuple(views))
-    return replace(cause, do=of_all_rows(cause, run, robot), probability=0.0)
+def _tool_switched(
+    run: RunState, robot: str, found: Sequence[tuple[PairAlone, Finding]]
+) -> Finding | None:
+    """The finding that a tool was active at some stops of a robot, which all of its pairs show.
+
+    Each pair leaves out the views with the tool, or those without it: then its tool is the inverse.
+    """
+    tools = [_tool_of(cause) for _, cause in found]
+    stops = {view.number: stop_of(view) for view in run.session.views}
+    active, idle = set[int](), set[int]()
+    for (one, cause), tool in zip(found, tools, strict=True):
+        if tool is None or tools[0] is None:
+            return None
+        left_out, used = ({stops[at] for at in some} for some in (cause.views, one.answer.used))
+        if _is_same(tools[0], tool):
+            active, idle = active | left_out, idle | used
+        elif _is_same(tools[0], invert(tool)):
+            active, idle = active | used, idle | left_out
+        else:
+            return None
+    if active & idle or tools[0] is None:
+        return None
+    first, last = min(active), max(active)
+    # Before or after a switch it was active at all stops.
+    first = first if min(idle) < first else min(stops.values())
+    last = last if max(idle) > last else max(stops.values())
+    is_switched = not any(first <= stop <= last for stop in idle)
+    views = [
+        view.number
+        for view in rows_of_robot(run.session, robot)
+        if (first <= stop_of(view) <= last if is_switched else stop_of(view) in active)
+    ]
+    shown, *others = (pair.words for pair, _ in found)
+    alike = f", and alike of {some_of(others)}," if others else ""
+    words = (
+        f"{robot_words(robot)}: in {view_words(views)}, the controller's tool was another one, by "
+        f"{other_frame(tools[0], np.eye(4))}, as its rows of {shown}{alike} show."
+    )
+    twist = *(1e3 * tools[0][:3, 3]), *np.rad2deg(log(tools[0])[:3])
+    numbers = ",".join(f"{value:.4f}" for value in twist)
+    done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
+    step = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
+    step += " Else fasten what the flange carries, and record again."
+    words = f"{words[0].upper()}{words[1:]}"
+    return Finding("something_moved", words, replace(done, words=step), tuple(views))
+
+
+def _tool_of(cause: Finding) -> FloatArray | None:
+    """The tool (4, 4) in the flange that a finding takes off some poses; None of another one."""
+    named = _TOOL.search("" if cause.do is None else cause.do.command)
+    if named is None:
+        return None
+    numbers = np.array([float(number) for number in named[1].split(",")])
+    turn = Rotation.from_rotvec(numbers[3:], degrees=True).as_matrix()
+    return compose(turn, 1e-3 * numbers[:3])
+
+
+def _is_same(tool: FloatArray, other: FloatArray) -> bool:
+    """Whether two tools are one, but for what an arm errs by."""
+    return bool(np.less(_apart(invert(tool) @ other), CalibrationLimits.arm_errors).all())
 
 
 def of_all_rows(
@@ -144,18 +204,18 @@ def of_all_rows(
     named = None if do is None else _ON_VIEWS.search(do.command)
     if do is None or named is None:
         return do
-    stops = {at.stop for at in rows if not found.views or at.number in found.views}
+    stops = {stop_of(at) for at in rows if not found.views or at.number in found.views}
     of_robot = rows_of_robot(run.session, robot)
-    ends = [at for at, view in enumerate(of_robot) if view.stop in stops]
+    ends = [at for at, view in enumerate(of_robot) if stop_of(view) in stops]
     if not ends:
         return Remedy(do.words)
     if named[1] == "shift":
         shown = {*found.views} if pair is None else {*pair.poses}
         first = 0 if pair is not None and min(shown) in found.views else ends[0]
         end = None if pair is not None and max(shown) in found.views else ends[-1] + 1
-        stops = {at.stop for at in of_robot[first:end]}
+        stops = {stop_of(at) for at in of_robot[first:end]}
     start, end = named.span(2)
-    every = ranges([at.number for at in of_robot if at.stop in stops])
+    every = ranges([at.number for at in of_robot if stop_of(at) in stops])
     return replace(do, command=f"{do.command[:start]}{every}{do.command[end:]}")
 
 
@@ -168,7 +228,7 @@ def _contradictions(run: RunState, every: Sequence[PairAlone]) -> Iterator[Findi
                 step = invert(one.frames[frame]) @ other.frames[frame]
                 covariance = one.covariance(frame) + other.covariance(frame)
                 twist = log(step)
-                is_clear = twist @ np.linalg.solve(covariance, twist) > _SIGMAS**2
+                is_clear = twist @ np.linalg.pinv(covariance, hermitian=True) @ twist > _SIGMAS**2
                 if is_clear and np.greater(_apart(step), CalibrationLimits.arm_errors).any():
                     yield _contradiction(run, one, other, frame, step)
                     return
@@ -180,9 +240,11 @@ def _apart(step: FloatArray) -> tuple[float, float]:
 
 
 def _agrees(one: PairAlone) -> bool:
-    """Whether most views of a pair agree by themselves."""
+    """Whether the views of a pair agree by themselves, with no cause but sources of its sigmas."""
     verdict = one.answer.verdict
-    return verdict is not None and verdict.status != "bad"
+    if verdict is None or verdict.status == "bad":
+        return False
+    return all(cause.kind in _SIZES for cause in verdict.causes)
 
 
 def _contradiction(
@@ -203,21 +265,16 @@ def _contradiction(
         )
         do = mending("they are numbered alike", f"--turned {ranges(views)}:180,{x},{y}")
         return Finding(PAIRS_APART.kind, words, do, views)
-    others = [
-        view
-        for pair in pairs_of(run, one.robot)
-        if pair.camera == other.pair.camera
-        for view in pair.poses
-    ]
+    others = [view.number for view in run.session.views if view.number not in other.pair.poses]
     moved = "it was moved" if board is not None else "the board was another one"
     words = (
         f"{both}, but place {frame} {mm_and_deg(*_apart(step))} apart: between their views, "
         f"{moved}, or the rows of one have another lens, board or robot than is stated."
     )
     do = or_alone(
-        "Look at one picture of each, and record both with one setup; or calibrate the rows of one "
-        "camera alone.",
-        sorted(others),
+        "Look at one picture of each, and record both with one setup; or calibrate without the "
+        f"views of {other.words}.",
+        others,
     )
     return Finding(PAIRS_APART.kind, words, do, views)
 

@@ -13,6 +13,7 @@ from scipy.special import gammaln
 
 from visioncal.calibration.guess.fit import mounting_fits, robust_fits
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.cell import stop_of
 from visioncal.calibration.stages.readings import places_of_one_point
 from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.transforms import invert, rotation_angle
@@ -74,8 +75,8 @@ class Record:
             of_point = places_of_one_point(read)
             every = {number: view for number, view in every.items() if number in of_point}
         known = {number: run.base_from_flange.get(number) for number in every}
-        if stops and len({view.stop for view in every.values()} & stops.keys()) == len(every):
-            at_stop = {view.stop: number for number, view in every.items()}
+        if stops and len({stop_of(view) for view in every.values()} & stops.keys()) == len(every):
+            at_stop = {stop_of(view): number for number, view in every.items()}
             known = {at_stop.get(stop, of.view): of.pose for stop, of in stops.items()}
         views = [*known]
         robot = np.full((len(views), 4, 4), np.nan)
