@@ -239,7 +239,7 @@ def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
             except VisioncalError as error:
                 likely = explained(error, state, stage.name, are_located=are_located)
                 if likely.message == error.message and stage.name in ("solve", "examine"):
-                    likely = _explained_by_pairs(error, state)
+                    likely = _explained_by_pairs(likely, state)
                 if likely is error:
                     raise
                 raise likely from error
