@@ -130,7 +130,7 @@ def touch_targets(
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
         covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
-        # Rounded up: no gap as large as the limit that was told exceeds it.
+        # Rounded up: no gap as large as the stated limit exceeds it.
         radius_mm = rounded_up(float(np.hypot(1e3 * radius95(covariance), _READ_MM)))
         points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
     return TouchTargets(tuple(points), frame)

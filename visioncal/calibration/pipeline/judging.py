@@ -22,7 +22,7 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of, view_words
 from visioncal.core.types import FloatArray, Rejection
-from visioncal.core.verdict import Finding, Remedy, of_cell
+from visioncal.core.verdict import Finding, Remedy, Verdict, of_cell
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
@@ -53,12 +53,14 @@ def judge_run(state: RunState) -> RunState:
             rest = (found for found in findings.warnings if found.kind not in BY_CHAIN)
             findings = replace(findings, warnings=(*state.misread, *rest))
             verdict = judge(findings)
-    if state.mount is None:
-        verdict = replace(
-            verdict, findings=of_cell(verdict.findings, len(state.robots), len(state.cameras))
-        )
-    warnings = tuple(findings.warnings)
-    return replace(state, warnings=warnings, findings=findings, verdict=verdict)
+    return _judged(state, findings, verdict)
+
+
+def _judged(state: RunState, findings: Findings, verdict: Verdict) -> RunState:
+    """The run with a verdict, whose commands are for its robots and cameras."""
+    remedies = of_cell(verdict.findings, len(state.robots), len(state.cameras))
+    verdict = replace(verdict, findings=remedies)
+    return replace(state, warnings=tuple(findings.warnings), findings=findings, verdict=verdict)
 
 
 def judged_beside(state: RunState, found: Sequence[Finding]) -> RunState:
@@ -74,11 +76,7 @@ def judged_beside(state: RunState, found: Sequence[Finding]) -> RunState:
     effects = ("moved_frame",) if any(each.kind == "something_moved" for each in found) else ()
     warnings = (*found, *(at for at in findings.warnings if at.kind not in effects))
     findings = replace(findings, pairs=pairs, warnings=warnings)
-    verdict = judge(findings)
-    verdict = replace(
-        verdict, findings=of_cell(verdict.findings, len(state.robots), len(state.cameras))
-    )
-    return replace(state, warnings=warnings, findings=findings, verdict=verdict)
+    return _judged(state, findings, judge(findings))
 
 
 # Share of a variance that is left without a source to which most of it is due.

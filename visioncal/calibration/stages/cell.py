@@ -61,7 +61,7 @@ class Cell:
         """The views from a station on."""
         return [row.view for row in (*self.rows, *self.held) if row.station >= station]
 
-    def rows_of_robot(self, robot: str, stop: int) -> list[int]:
+    def views_of_robot(self, robot: str, stop: int) -> list[int]:
         """The views with a robot's poses from a stop of the session on."""
         own = (
             view

@@ -99,7 +99,7 @@ def _of_tool(
     if carried - {one.frame for one in moves if one.first_stop == moved.first_stop}:
         return None
     robot = next(name for name, at in tree.flanges.items() if at == flange)
-    views = cell_fit.cell.rows_of_robot(robot, moved.first_stop)
+    views = cell_fit.cell.views_of_robot(robot, moved.first_stop)
     plain = _moved(moved)
     otherwise = f"fasten {frame}, and record again."
     do = tool_taken_off(cell_fit, frame, (before, after), views, otherwise)

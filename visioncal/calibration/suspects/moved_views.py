@@ -10,12 +10,13 @@ from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, ranges, view_words
 from visioncal.core.transforms import exp, invert, log, pose_difference, rotation_angle
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.estimation.moves import find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.steps import step_of
+from visioncal.vision.targets import half_turn_of
 
 # Views among many outliers of one end that agree by chance, one of so many; what a step that few
 # times exceeds the noise leaves of these, and poses that are wrong apart never do.
@@ -276,12 +277,23 @@ def tool_taken_off(
     is_ruled_out = robot is None or cell_fit.arms[robot].is_modelled
     if is_ruled_out or cell_fit.cell.mount == "instrument":
         return None
-    tool = edges[0] @ invert(edges[1])
+    return without_tool(edges[0] @ invert(edges[1]), views, otherwise)
+
+
+def without_tool(tool: FloatArray, views: Sequence[int], otherwise: str) -> Remedy:
+    """Advice to take a tool (4, 4) in the flange off some views' poses, if it was active there."""
     twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
     numbers = ",".join(f"{value:.4f}" for value in twist)
     done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
     first = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
     return replace(done, words=f"{first} Else {otherwise}")
+
+
+def turned_back(board: Target, views: Sequence[int]) -> Remedy:
+    """Advice to turn a board back that some views number from the other end."""
+    _, (x, y) = half_turn_of(board)
+    option = f"--turned {ranges(views)}:180,{1e3 * x:.2f},{1e3 * y:.2f}"
+    return mending("it is turned back", option)
 
 
 def is_switched(step: FloatArray) -> bool:

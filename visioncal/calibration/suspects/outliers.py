@@ -15,9 +15,10 @@ from visioncal.calibration.suspects.moved_views import (
     fault_of,
     of_moved,
     pushed_base,
+    turned_back,
 )
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, listed, ranges, some_of, view_words
+from visioncal.core.number_format import figure, listed, some_of, view_words
 from visioncal.core.transforms import distances, invert, pose_difference
 from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Remedy, mending
@@ -116,7 +117,7 @@ def _turned(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     session = cell_fit.cell.session
     for name, board in session.boards.items():
         frame = session.board_frames[name]
-        half_turn, (x, y) = half_turn_of(board)
+        half_turn, _ = half_turn_of(board)
         away_m, away_rad = distances(half_turn[None], steps)
         seen = np.array([rows[at].seen == frame for at in outliers.tolist()])
         is_turned = seen & (1e3 * away_m < KNOCKED[0]) & (np.rad2deg(away_rad) < KNOCKED[1])
@@ -124,12 +125,11 @@ def _turned(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
             continue
         some = outliers[is_turned].tolist()
         views = [rows[at].view for at in some]
-        middle = f"{1e3 * x:.2f},{1e3 * y:.2f}"
         short = f"{frame} was read turned by 180 deg in its plane"
         words = (
             f"in {{views}} {short}, its corners numbered from the other end. They were left out."
         )
-        do = mending("it is turned back", f"--turned {ranges(views)}:180,{middle}")
+        do = turned_back(board, views)
         yield fault_of(cell_fit, "turned_board", some, words, do, short)
 
 

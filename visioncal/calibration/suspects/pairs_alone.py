@@ -16,17 +16,21 @@ from visioncal.calibration.pipeline.guess_inputs import of_pair
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import rows_of_robot, stop_of
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
-from visioncal.calibration.suspects.moved_views import KNOCKED, other_frame
+from visioncal.calibration.suspects.moved_views import (
+    KNOCKED,
+    other_frame,
+    turned_back,
+    without_tool,
+)
 from visioncal.calibration.suspects.suspect import SOURCES, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, ranges, robot_words, some_of, view_words
 from visioncal.core.transforms import compose, invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Target
-from visioncal.core.verdict import Finding, Remedy, mending, or_alone
+from visioncal.core.verdict import Finding, Remedy, or_alone
 from visioncal.estimation.unknowns import EDGE
 from visioncal.session import Session
-from visioncal.session.frames import object_name
 from visioncal.vision.targets import half_turn_of
 
 PairRun = Callable[[Session, Mapping[int, Corners]], RunState]
@@ -168,13 +172,8 @@ def _tool_switched(
         f"{robot_words(robot)}: in {view_words(views)}, the controller's tool was another one, by "
         f"{other_frame(tools[0], np.eye(4))}, as its rows of {shown}{alike} show."
     )
-    twist = *(1e3 * tools[0][:3, 3]), *np.rad2deg(log(tools[0])[:3])
-    numbers = ",".join(f"{value:.4f}" for value in twist)
-    done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
-    step = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
-    step += " Else fasten what the flange carries, and record again."
-    words = f"{words[0].upper()}{words[1:]}"
-    return Finding("something_moved", words, replace(done, words=step), tuple(views))
+    do = without_tool(tools[0], views, "fasten what the flange carries, and record again.")
+    return Finding("something_moved", f"{words[0].upper()}{words[1:]}", do, tuple(views))
 
 
 def _tool_of(cause: Finding) -> FloatArray | None:
@@ -188,7 +187,7 @@ def _tool_of(cause: Finding) -> FloatArray | None:
 
 
 def _is_same(tool: FloatArray, other: FloatArray) -> bool:
-    """Whether two tools are one, but for what an arm errs by."""
+    """Whether two tools or turns are one, but for what an arm errs by."""
     return bool(np.less(_apart(invert(tool) @ other), CalibrationLimits.arm_errors).all())
 
 
@@ -253,18 +252,14 @@ def _contradiction(
     """The finding that two pairs agree by themselves, and place a frame otherwise."""
     views = tuple(sorted(other.pair.poses))
     both = f"{one.words} agree by themselves, and so do {other.words}"
-    board = (
-        run.session.plates.get(object_name(frame, "target")) if frame == one.pair.target else None
-    )
-    middle = None if board is None else _half_turn(board, step)
-    if middle is not None:
-        x, y = (f"{1e3 * value:.2f}".rstrip("0").rstrip(".") for value in middle)
+    boards = {at: run.session.boards[name] for name, at in run.session.board_frames.items()}
+    board = boards.get(frame)
+    if board is not None and _is_half_turn(board, step):
         words = (
             f"{other.pair.camera} numbers the corners of {frame} from the other end, turned by 180 "
             f"deg in its plane, than {one.pair.camera}: {both}."
         )
-        do = mending("they are numbered alike", f"--turned {ranges(views)}:180,{x},{y}")
-        return Finding(PAIRS_APART.kind, words, do, views)
+        return Finding(PAIRS_APART.kind, words, turned_back(board, views), views)
     others = [view.number for view in run.session.views if view.number not in other.pair.poses]
     moved = "it was moved" if board is not None else "the board was another one"
     words = (
@@ -279,11 +274,9 @@ def _contradiction(
     return Finding(PAIRS_APART.kind, words, do, views)
 
 
-def _half_turn(board: Target, step: FloatArray) -> tuple[float, float] | None:
-    """Middle (2,) [m] about which a board is turned by 180 deg in its plane by a step, if it is."""
-    turn, middle = half_turn_of(board)
-    is_turned = np.less(_apart(invert(turn) @ step), CalibrationLimits.arm_errors).all()
-    return middle if is_turned else None
+def _is_half_turn(board: Target, step: FloatArray) -> bool:
+    """Whether a step turns a board by 180 deg in its plane, but for what an arm errs by."""
+    return _is_same(half_turn_of(board)[0], step)
 
 
 PAIRS_APART = Suspect("pairs_apart", None, 1e-6, of_chain=True, hides=("wrong_views", UNEXPLAINED))
