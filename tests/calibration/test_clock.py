@@ -12,10 +12,10 @@ from support.refusals import raised
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, calibrate
+from visioncal.calibration.stages.cameras import stated_poses
 from visioncal.calibration.stages.clock_offset import why_undetermined
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import stated_poses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS

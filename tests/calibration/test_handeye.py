@@ -18,11 +18,10 @@ import visioncal
 from visioncal.calibration.pipeline.starting import find_start
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.transforms import compose, exp, invert, log, robot_part
 from visioncal.core.types import Corners
-from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fit_problem, solve_problem
@@ -30,6 +29,7 @@ from visioncal.session import Session
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, measured_poses, project, simulate
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.intrinsics import estimate_intrinsics
+from visioncal.vision.pnp import estimate_poses
 from visioncal.vision.targets import corner_positions, rotations
 
 NOISE = Noise.of_robot(1e-3, 5e-4)

@@ -22,18 +22,13 @@ from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arm_report import add_parameters
 from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.transforms import exp, invert, log, robot_part
 from visioncal.core.types import MOUNTS, FloatArray
-from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.arm import arm_effect
 from visioncal.estimation.armpair import ArmData, ArmPair
-from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.chain import chain
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.identifiability import (
-    joint_words,
-    observability_indices,
-    parameter_words,
-)
+from visioncal.estimation.identifiability import observability_indices, parameter_words
 from visioncal.estimation.parameters import Parameter
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution
@@ -44,7 +39,10 @@ from visioncal.planning.purposes import PURPOSES
 from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
 from visioncal.robot import Loads, Robot, load_robot
+from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.elasticity import WeightFunctions
+from visioncal.robot.errors import ArmErrors
+from visioncal.robot.model import joint_words
 from visioncal.robot.workspace import postures
 from visioncal.simulation import CellOptions, Payload, cell_session, simulate
 from visioncal.simulation.arms import forward
@@ -71,7 +69,7 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     sizes = sum(SIZES[index] for index in blocks) * robot.joint_count
     model = ArmModel(robot, TOOL, dict.fromkeys(blocks, 1.0), np.zeros(sizes))
     poses = model.robot.base_from_flange(q)
-    effect = ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True).effect(ROBOT)
+    effect = arm_effect(ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True), ROBOT)
     covariance = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
     seen = invert(robot_part(poses, mount) @ X) @ Z
     problem = chain(mount, poses, seen, covariance, effects=[effect])

@@ -19,7 +19,7 @@ from support.rendered import line_kernel
 
 from visioncal import calibrate, doctor
 from visioncal.calibration.run import run
-from visioncal.calibration.stages.detect import detect, find_corners
+from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert, log
@@ -39,6 +39,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.render import developed, encode, light_on
 from visioncal.vision.boards import NotFound, find_target
+from visioncal.vision.detection import find_corners
 from visioncal.vision.targets import (
     corner_positions,
     load_target,

@@ -49,7 +49,6 @@ from visioncal.core.verdict import (
     remarks,
     with_paths,
 )
-from visioncal.estimation.arm import ArmErrors, pose_basis
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.estimation.unknowns import LENS
 from visioncal.interchange.formats.mending import remove_tool
@@ -59,6 +58,7 @@ from visioncal.results import Calibration, Rms, to_document
 from visioncal.results.parts import VerdictForm
 from visioncal.robot import load_robot
 from visioncal.robot.conversion import with_base
+from visioncal.robot.errors import ArmErrors, pose_basis
 from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
 from visioncal.session.columns import POSE

@@ -15,18 +15,11 @@ from visioncal.calibration.pipeline.arm_results import misfit_covariance
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.core.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.quantiles import radius95
+from visioncal.core.transforms import LEVER_M, exp, invert, log, point_covariance
 from visioncal.core.types import Corners
-from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
-from visioncal.estimation.arm import (
-    LEVER_M,
-    ArmErrors,
-    covariance_of_size,
-    link_basis,
-    pose_basis,
-)
-from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.budget import point_covariance, radius95
+from visioncal.estimation.appearance import Appearance, compress
+from visioncal.estimation.arm import arm_effect, covariance_of_size
 from visioncal.estimation.chain import chain
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.mixed import (
@@ -39,7 +32,10 @@ from visioncal.estimation.mixed import (
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.robot import load_robot
+from visioncal.robot.arm_model import ArmModel
+from visioncal.robot.errors import ArmErrors, link_basis, pose_basis
 from visioncal.simulation import CAMERAS, CellOptions, cell_session, simulate
+from visioncal.vision.board_shape import BOARD_NAMES, SCALE, board_basis
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.corners import CornerStack, reproject
 from visioncal.vision.field_modes import field_modes
@@ -457,7 +453,7 @@ def test_the_sigma_of_the_size_of_an_arms_errors_is_right():
     problem = observed_world(world(rng, stops=8), rng)
     # Six errors, of which four are told.
     errors = ArmErrors(np.zeros((8, 6, 6)), 1e-3, 100.0, True)
-    erring = problem.with_effects([errors.effect("a")])
+    erring = problem.with_effects([arm_effect(errors, "a")])
     arm = erring.effect_columns["arm of a"]
     covariance = np.zeros((erring.size, erring.size))
     covariance[arm, arm] = np.diag([1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])

@@ -16,7 +16,6 @@ from visioncal.core.errors import ConvergenceError
 from visioncal.core.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation import joint
-from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock import clock_problem
@@ -48,6 +47,7 @@ from visioncal.verification.model_evidence import (
     undone,
     with_change,
 )
+from visioncal.vision.board_shape import SCALE
 from visioncal.vision.camera import intrinsics
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")

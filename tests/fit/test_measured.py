@@ -12,7 +12,6 @@ from support.small_cells import BOARD, PX, ROBOT_M, ROBOT_RAD, TABLE, made, pose
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.inliers import Search, nearest
 from visioncal.fit.linearise import linearised
 from visioncal.fit.pairs import pairs_of
@@ -22,6 +21,7 @@ from visioncal.fit.unknowns import State, printed_board
 from visioncal.model import Arm, Cell, MeasuredPlace, MeasuredPose, Moments, Sighting, read_cell
 from visioncal.model.arm import even_progress
 from visioncal.session import Session
+from visioncal.session.tree import Branch, Tree
 from visioncal.vision.targets import corner_positions
 
 TRACKER_M, TRACKER_RAD = 2e-5, 5e-5

@@ -11,12 +11,12 @@ from support.small_cells import TABLE, made, pose, seen_at
 from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.consensus import Candidates, hand_eye
 from visioncal.fit.solve import solve
 from visioncal.fit.start import start_of
 from visioncal.model import Arm, Cell, MeasuredPose, Moments, Sighting
 from visioncal.model.arm import even_progress
+from visioncal.session.tree import Branch, Tree
 from visioncal.vision.targets import rotation_transforms, rotations
 
 

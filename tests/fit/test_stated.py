@@ -11,13 +11,13 @@ from test_measured import is_fair
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.held import with_small_sizes
 from visioncal.fit.lens_field import by_lens
 from visioncal.fit.score import Score
 from visioncal.fit.solve import solve
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
 from visioncal.model.sightings import is_copy
+from visioncal.session.tree import Branch, Tree
 from visioncal.simulation import instrument_session, simulate
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of
 from visioncal.vision.camera import intrinsics, project, with_intrinsics

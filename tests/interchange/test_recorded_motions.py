@@ -17,7 +17,6 @@ from support.marks import crossed, slow
 from support.refusals import raised
 
 from visioncal import calibrate, simulation
-from visioncal.calibration.stages.motion import motion_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import pose_difference
 from visioncal.interchange.formats import (
@@ -30,6 +29,7 @@ from visioncal.interchange.formats import (
 from visioncal.interchange.formats.lerobot import FrameImages
 from visioncal.session import Session
 from visioncal.session.depth import read_depth
+from visioncal.session.motion import motion_of
 from visioncal.simulation import CAMERAS, CellOptions, DepthOptions
 
 BOARD = ImportOptions(target="charuco_9x6_30mm")

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.chain import FLANGE, robot_part
+from visioncal.core.transforms import robot_part
+from visioncal.estimation.chain import FLANGE
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.observability import chain_words, check_determined, refuse_too_few
 from visioncal.estimation.outliers import InlierFit, find_inliers

@@ -6,9 +6,9 @@ from typing import Any
 from support.samples import Sample
 
 from visioncal.core.codec import read_fields
-from visioncal.estimation.appearance import BOARD_NAMES
 from visioncal.results import Calibration
 from visioncal.results.sections import CalibrationSections
+from visioncal.vision.board_shape import BOARD_NAMES
 
 # So begins the reason of a view that contradicts the others; test_report checks it on a real one.
 CONTRADICTS = "disagrees with the other views: it places the target 36 mm and 1.5 deg away"

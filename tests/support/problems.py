@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
-from visioncal.estimation.tree import Branch, Tree
+from visioncal.session.tree import Branch, Tree
 
 # Of a camera's poses [rad and m]: across the view, and towards it.
 CAMERA_SIGMAS = np.array([3e-4, 3e-4, 1e-4, 3e-5, 3e-5, 1.2e-4])

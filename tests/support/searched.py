@@ -7,9 +7,10 @@ from dataclasses import replace
 from importlib import import_module
 
 from visioncal.calibration.pipeline import mended_images
-from visioncal.calibration.stages import detect, other_board
+from visioncal.calibration.stages import other_board
 from visioncal.core.types import Corners
 from visioncal.verification import scene_audit
+from visioncal.vision import detection
 from visioncal.vision.boards.identify import identify
 from visioncal.vision.boards.layout import decoded
 from visioncal.vision.scene import register
@@ -27,18 +28,18 @@ def _once(search):
     return found
 
 
-_corners_in, _identify = _once(detect.corners_in), _once(identify)
+_corners_in, _identify = _once(detection.corners_in), _once(identify)
 
 
 def corners_in(image, target, view=0):
-    """Corners as `detect.corners_in` finds them, whichever view shows the picture."""
+    """Corners as `detection.corners_in` finds them, whichever view shows the picture."""
     found = _corners_in(image, target)
     return replace(found, view=view) if isinstance(found, Corners) else found
 
 
 # What searches, by module and name.
 SEARCHES = [
-    (detect, "corners_in", corners_in),
+    (detection, "corners_in", corners_in),
     (other_board, "identify", _identify),
     (mended_images, "identify", _identify),
     # Packages offer functions of the modules' names.

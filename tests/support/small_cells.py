@@ -7,10 +7,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.types import Corners, Target
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.model import Arm, Cell, Moments, Sighting
 from visioncal.model.arm import even_progress
 from visioncal.session.document import CameraTable
+from visioncal.session.tree import Branch, Tree
 from visioncal.vision.targets import corner_positions
 
 BOARD = Target("board", "checkerboard", 5, 4, 0.04, 4e-6)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
-from visioncal.estimation.observability import Direction
+from visioncal.core.directions import Direction
 from visioncal.results import HELD_BACK, ViewResult
 
 

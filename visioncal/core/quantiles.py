@@ -3,7 +3,7 @@
 By scipy.special, because SciPy's statistics and optimisers take longer to import than these to run.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,10 @@ SIGMA_PER_MAD = 1.4826
 def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:
     """Upper quantile of chi-square: exceeded with probability `chance` at `freedom` degrees."""
     return np.asarray(chdtri(freedom, chance), dtype=float)
+
+
+# Square root of the likelihood-ratio limit of a 95 % interval of one unknown.
+SURPRISE_95 = float(np.sqrt(chi2_limit(0.05, 1)))
 
 
 def f_limit(chance: float, freedom: npt.ArrayLike, of_noise: float) -> FloatArray:
@@ -59,3 +63,29 @@ def root_of(rising: Callable[[float], float], low: float, high: float, tolerance
             low, below, above = at, value, above / 2 if last == side else above
         last = side
     return (low + high) / 2
+
+
+def radius95(covariance: FloatArray) -> float:
+    """Radius of the ball that contains a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
+    values = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
+    if not third > 0.0:
+        return 0.0
+    freedom = second**3 / third**2
+    quantile = (chi2_limit(0.05, freedom) - freedom) * np.sqrt(second / freedom) + first
+    return float(np.sqrt(max(quantile, 0.0)))
+
+
+def freedom_of(intervals: Iterable[Sequence[float]]) -> float:
+    """Degrees of freedom of levels by the width of their 95 % intervals, low and high.
+
+    The logarithm of a level with n degrees of freedom has a sigma of 1 / sqrt(2 n). Rotation and
+    translation contribute about equally at half a metre from the flange, where arms err by 0.6 mm
+    for each mrad, so that their degrees add up (Satterthwaite 1946). A poorly determined level adds
+    little.
+    """
+    freedoms = [
+        2.0 * (SURPRISE_95 / np.log(high / low)) ** 2 for low, high in intervals if 0.0 < low < high
+    ]
+    # Levels not significantly above zero have those of a handful of stops.
+    return max(float(sum(freedoms)), 8.0)

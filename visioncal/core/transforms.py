@@ -8,7 +8,10 @@ perturbations act on the right, in the local frame: `T * exp(twist)`.
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Mount
+
+# Arms are off by some 0.5 mm for each mrad.
+LEVER_M = 0.5
 
 # Tolerance of rotation matrices, which are given with five digits or more.
 RIGID = 1e-4
@@ -220,3 +223,31 @@ def rigid_fault(matrix: FloatArray, most: float = RIGID) -> str:
             f"{error:.2g}, and {most:g} is allowed"
         )
     return "" if np.linalg.det(matrix[:3, :3]) > 0.0 else "its rotation is a reflection"
+
+
+def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
+    """Robot transforms (m, 4, 4) of the chain `robot * x * camera = z`."""
+    return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
+
+
+def point_covariance(edge: FloatArray, covariance: FloatArray, point: FloatArray) -> FloatArray:
+    """Covariance of a point mapped by an uncertain transform.
+
+    Args:
+        edge: (4, 4) `a_from_b`.
+        covariance: (6, 6) of its right perturbation (rotation, translation).
+        point: (3,) in frame b, exact [m].
+
+    Returns:
+        (3, 3) of the point in frame a [m^2].
+    """
+    jacobian = edge[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1)
+    return np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+def distances_m(poses: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Distances (...) [m] of (..., 4, 4) poses from predicted ones, rotations on a lever."""
+    between = invert(predicted) @ poses
+    return np.asarray(
+        np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
+    )

@@ -25,12 +25,12 @@ from scipy.special import ive
 
 from visioncal.core.linalg import gram
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT, JointFunctions
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedEstimate
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
+from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT, JointFunctions
+from visioncal.robot.errors import SIGNIFICANT, ArmErrors
 
 # Lengths tried [rad], longest first, and the highest harmonic in inverse lengths: three thousandths
 # of the variance lie beyond. Shorter ones are not tried after this many that are less likely.

@@ -6,12 +6,12 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Linear, Noise, Observations, State
 from visioncal.estimation.unknowns import ARM
 from visioncal.robot import Loads
+from visioncal.robot.arm_model import ArmModel
 
 
 @dataclass(frozen=True, eq=False)

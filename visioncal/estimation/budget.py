@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visioncal.core.linalg import covariance_among, gram
-from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.normal_equations import Whitening, fisher_information
 from visioncal.estimation.problem import Problem
@@ -104,29 +102,3 @@ def less_noise(
     index = problem.robots.index(robot)
     change = white**2 - noise.robots[index] ** 2
     return _Gain.of(problem, state, noise).of_flange(problem, index, change)
-
-
-def radius95(covariance: FloatArray) -> float:
-    """Radius of the ball that contains a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
-    values = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
-    first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
-    if not third > 0.0:
-        return 0.0
-    freedom = second**3 / third**2
-    quantile = (chi2_limit(0.05, freedom) - freedom) * np.sqrt(second / freedom) + first
-    return float(np.sqrt(max(quantile, 0.0)))
-
-
-def point_covariance(edge: FloatArray, covariance: FloatArray, point: FloatArray) -> FloatArray:
-    """Covariance of a point mapped by an uncertain transform.
-
-    Args:
-        edge: (4, 4) `a_from_b`.
-        covariance: (6, 6) of its right perturbation (rotation, translation).
-        point: (3,) in frame b, exact [m].
-
-    Returns:
-        (3, 3) of the point in frame a [m^2].
-    """
-    jacobian = edge[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1)
-    return np.asarray(jacobian @ covariance @ jacobian.T)

@@ -15,23 +15,10 @@ from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Effect, Observations, State
-from visioncal.estimation.tree import Branch, Tree
+from visioncal.session.frames import edge_names
+from visioncal.session.tree import Branch, Tree
 
 BASE, FLANGE = "base", "flange"
-
-
-def edge_names(mount: Mount) -> tuple[str, str]:
-    """Names of the edges of the camera and of a single target."""
-    if mount == "instrument":
-        return "base_from_instrument", "flange_from_probe"
-    if mount == "eye-in-hand":
-        return "flange_from_cam", "base_from_target"
-    return "base_from_cam", "flange_from_target"
-
-
-def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
-    """Robot transforms (m, 4, 4) of the chain `robot * x * camera = z`."""
-    return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
 
 
 def scatter(problem: Problem, others: Problem, state: State) -> tuple[FloatArray, FloatArray]:

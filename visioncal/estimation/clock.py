@@ -14,8 +14,9 @@ import numpy as np
 from visioncal.core.linalg import covariance_from, gram
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import robot_part
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, evenly
-from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.chain import chain
 from visioncal.estimation.clock_correlation import (
     FEWEST_FRAMES,
     MOST_FRAMES,

@@ -24,14 +24,15 @@ import numpy as np
 from visioncal.core.linalg import covariance_among
 from visioncal.core.transforms import adjoint
 from visioncal.core.types import Camera, FloatArray, IntArray
-from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.arm import arm_effect
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Linear, Noise, Observations, State
 from visioncal.estimation.solve import Solution, covariance_of
-from visioncal.estimation.tree import Tree
 from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE, Unknown, Unknowns
+from visioncal.robot.errors import ArmErrors
+from visioncal.session.tree import Tree
 from visioncal.vision.lens_field import LensLevels
 
 
@@ -283,7 +284,7 @@ class Fit:
         in_time, index = errors.basis[:, :, errors.is_time_correlated], self.robots.index(robot)
         noise = self.noise if errors.white is None else self.noise.with_robot(index, errors.white)
         own = replace(errors, basis=in_time, time_correlated_count=in_time.shape[2])
-        wide = self.with_columns(own.effect(robot, "lasting errors"))
+        wide = self.with_columns(arm_effect(own, robot, "lasting errors"))
         return replace(wide, solution=replace(wide.solution, noise=noise))
 
     def step_to(self, wide: "Fit") -> FloatArray:
@@ -299,7 +300,7 @@ class Fit:
         """
         size, last = self.problem.size, errors.is_time_correlated
         fit = self.beside_lasting(robot, errors) if last.any() else self
-        information = fit.with_columns(errors.effect(robot)).equations[0]
+        information = fit.with_columns(arm_effect(errors, robot)).equations[0]
         first = fit.problem.size
         fitted = covariance_among(information[:first, :first], fit.problem.moving)
         return np.asarray((fitted @ information[:first, first:])[:size] * ~last)

@@ -20,6 +20,7 @@ from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
 from visioncal.robot import Robot
+from visioncal.robot.model import joint_words
 
 # Directions whose singular value is below this share of the largest are unidentifiable.
 _LEAST_SHARE = 1e-7
@@ -124,11 +125,6 @@ def observability_indices(values: FloatArray, stops: int) -> dict[str, float]:
         "o4": least**2 / greatest,
         "o5": 1.0 / float(np.sum(1.0 / values)),
     }
-
-
-def joint_words(joint: int, robot: Robot) -> str:
-    """A joint by its number and its name."""
-    return f"joint {joint + 1} ({robot.joint_names[joint]})"
 
 
 def is_linear_zero(parameter: Parameter, robot: Robot) -> bool:

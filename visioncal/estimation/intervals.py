@@ -1,18 +1,11 @@
 """Uncertainty of the noise levels: expected variances, intervals, degrees of freedom."""
 
-from collections.abc import Iterable, Sequence
 from functools import partial
 
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.mixed import (
-    LEAST_SIGMA,
-    RATIO_LOG_SIGMA,
-    SURPRISE_95,
-    TYPICAL_RATIO,
-    profile_interval,
-)
+from visioncal.estimation.mixed import LEAST_SIGMA, RATIO_LOG_SIGMA, TYPICAL_RATIO, profile_interval
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -89,18 +82,3 @@ def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
         for level, sigma in enumerate(sigmas.tolist())
     ]
     return np.array(intervals).reshape(*noise.robots.shape, 2)
-
-
-def freedom_of(intervals: Iterable[Sequence[float]]) -> float:
-    """Degrees of freedom of levels by the width of their 95 % intervals, low and high.
-
-    The logarithm of a level with n degrees of freedom has a sigma of 1 / sqrt(2 n). Rotation and
-    translation contribute about equally at half a metre from the flange, where arms err by 0.6 mm
-    for each mrad, so that their degrees add up (Satterthwaite 1946). A poorly determined level adds
-    little.
-    """
-    freedoms = [
-        2.0 * (SURPRISE_95 / np.log(high / low)) ** 2 for low, high in intervals if 0.0 < low < high
-    ]
-    # Levels not significantly above zero have those of a handful of stops.
-    return max(float(sum(freedoms)), 8.0)

@@ -17,7 +17,6 @@ from visioncal.core.limits import CONTRADICTION
 from visioncal.core.linalg import ROUNDING, covariance_from
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
-from visioncal.estimation.appearance import SCALE, stated_board_sigma
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.mixed import PriorInformation
@@ -26,6 +25,7 @@ from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.unknowns import BOARD, LENS, SIZE
+from visioncal.vision.board_shape import SCALE, stated_board_sigma
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
 from visioncal.vision.corners import floored_sigma_px
 

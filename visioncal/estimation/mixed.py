@@ -25,7 +25,7 @@ from visioncal.core.linalg import (
     inverse_roots,
     times_root,
 )
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import SURPRISE_95
 from visioncal.core.types import FloatArray, IntArray, Mask
 
 # Typical translation to rotation noise of arms and cameras [m/rad]: median, and standard deviation
@@ -38,8 +38,6 @@ LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
 _LONGEST_STEP, _STEPS, _FLAT = 1.5, 60, 0.1
 # A smaller gain of log-likelihood corresponds to a hundredth of the levels' uncertainty.
 LITTLE = 2e-5
-# Square root of the likelihood-ratio limit of a 95 % interval of one unknown.
-SURPRISE_95 = float(np.sqrt(chi2_limit(0.05, 1)))
 # First and largest half width and tolerance of its search, in logarithms of the sigma.
 _FIRST_WIDTH, _WIDEST, _EXACT = 0.125, 4.0, 0.02
 

@@ -18,7 +18,7 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, by_noise_alone
-from visioncal.estimation.tree import Branch
+from visioncal.session.tree import Branch
 
 # Least share of the following observations explained; others may have moved, too, or be wrong.
 _LEAST_SHARE = 0.25

@@ -15,12 +15,12 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.directions import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.robust import ROUNDS, Distances, half_of, nearest, settled, widened
-from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.transforms import LEVER_M, invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.moves import (
     CREEP,
     Creep,
@@ -32,7 +32,6 @@ from visioncal.estimation.moves import (
     still_frames,
     with_creep,
 )
-from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Noise, State
 from visioncal.estimation.solve import (

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.transforms import LEVER_M
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.armmodel import ArmModel
+from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.chain import FUNCTION_NAMES
 from visioncal.robot.conversion import table_of
 from visioncal.robot.tables import DHTable

@@ -35,7 +35,7 @@ from visioncal.estimation.problem_parts import (
     rows_of,
     units_of,
 )
-from visioncal.estimation.tree import PathStep, Tree
+from visioncal.session.tree import PathStep, Tree
 
 # Uninformative variance of a flange error that was not observed [rad^2 and m^2].
 ANYTHING = 1e4

@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.core.transforms import exp, inverse_right_jacobian, log
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.tree import PathStep
+from visioncal.session.tree import PathStep
 
 # Name of the only robot of a cell.
 ROBOT = "robot"

@@ -8,13 +8,8 @@ import numpy as np
 
 from visioncal.core.linalg import covariance_from
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target
-from visioncal.estimation.appearance import (
-    BOARD_NAMES,
-    Compressed,
-    boards_basis,
-    shape_slices,
-    stated_board_sigma,
-)
+from visioncal.estimation.appearance import Compressed
+from visioncal.vision.board_shape import BOARD_NAMES, boards_basis, shape_slices, stated_board_sigma
 from visioncal.vision.corners import CornerStack, floored_sigma_px
 from visioncal.vision.lens_field import LensLevels, row_motions, zooms
 from visioncal.vision.targets import numbered_positions

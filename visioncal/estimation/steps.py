@@ -18,7 +18,7 @@ from visioncal.core.procrustes import align
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.transforms import adjoint, apply, compose, invert, log, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask, evenly
-from visioncal.estimation.arm import SIZES_M, TURN_PER_M, TWIST_UNITS, rows_of, stops_of
+from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.moves import CREEP, Creep, fitted_change, moved
 from visioncal.estimation.problem import Problem
@@ -31,6 +31,7 @@ from visioncal.estimation.solve import (
     fit_problem,
     fitted_covariance,
 )
+from visioncal.robot.errors import SIZES_M, TURN_PER_M, TWIST_UNITS
 
 FRAME, JOINT, SIZE, DRIFT = "frame", "joint", "size", "drift"
 # Sizes of changes with equal prior probability, and the unit of each value.

@@ -12,9 +12,15 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
 from visioncal.core.robust import REFINED, nearest, trimmed_start, trimmed_sum
-from visioncal.core.transforms import adjoint, compose, invert, mean_transform, rotation_angle
+from visioncal.core.transforms import (
+    LEVER_M,
+    adjoint,
+    compose,
+    distances_m,
+    invert,
+    mean_transform,
+)
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
@@ -26,14 +32,6 @@ WORST_M = 0.1
 AGREE_M = 0.02
 # Robot noise by which pairs are compared [rad], [m]; the camera's is negligible beside it.
 _ROBOT_SIGMA = 5e-4
-
-
-def distances_m(poses: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Distances (...) [m] of (..., 4, 4) poses from predicted ones, rotations on a lever."""
-    between = invert(predicted) @ poses
-    return np.asarray(
-        np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
-    )
 
 
 @dataclass(frozen=True, eq=False)

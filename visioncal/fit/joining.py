@@ -21,7 +21,6 @@ from visioncal.core.procrustes import align, spreads
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.positions import find_mounting, mounting_problem
-from visioncal.estimation.tree import PathStep, Tree
 from visioncal.fit.consensus import (
     AGREE_M,
     WORST_M,
@@ -32,6 +31,7 @@ from visioncal.fit.consensus import (
     hand_eye,
     partial_hand_eye,
 )
+from visioncal.session.tree import PathStep, Tree
 
 # Most orientations of boards that are tried.
 _MOST_TRIED = 256

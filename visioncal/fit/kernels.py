@@ -10,12 +10,7 @@ from scipy.spatial.distance import cdist
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import (
-    POSTURE_RANGE_RAD,
-    TWIST_UNITS,
-    pose_basis,
-    posture_features,
-)
+from visioncal.robot.errors import POSTURE_RANGE_RAD, TWIST_UNITS, pose_basis, posture_features
 
 # Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
 _RANGES, _MEMORIES = (POSTURE_RANGE_RAD, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)

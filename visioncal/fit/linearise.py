@@ -24,12 +24,12 @@ from visioncal.core.transforms import (
     skew,
 )
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.tree import PathStep
 from visioncal.fit.mixed import weights_at
 from visioncal.fit.pairs import Pair
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments
 from visioncal.model.effects import Displacement, Rolling, RowMotion
+from visioncal.session.tree import PathStep
 from visioncal.vision.camera import project_with_jacobian
 
 # Added to the information about a pose that corners leave open, over its diagonal.

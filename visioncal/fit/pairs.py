@@ -8,9 +8,9 @@ import numpy as np
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import Corners, FloatArray, IntArray
-from visioncal.estimation.tree import PathStep
 from visioncal.model import Cell, Moments, Sighting
 from visioncal.model.boards import SHAPES, shape_basis, shape_count
+from visioncal.session.tree import PathStep
 from visioncal.vision.targets import corner_positions
 
 

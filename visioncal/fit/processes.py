@@ -19,7 +19,6 @@ import numpy as np
 from scipy.linalg import lapack
 
 from visioncal.core.types import FloatArray, IntArray, evenly
-from visioncal.estimation.arm import posture_features
 from visioncal.fit.fit import Fit
 from visioncal.fit.kernels import SIZES, WHITE, Process, Shared, StopErrors, Tried, processes
 from visioncal.fit.mixed import body_with, factors_of, inverse
@@ -27,6 +26,7 @@ from visioncal.fit.score import Added, Products, Score, products
 from visioncal.fit.unknowns import Key, Prior
 from visioncal.model.effects import Effect
 from visioncal.model.effects.posture import PostureEffect, twists_of_frames
+from visioncal.robot.errors import posture_features
 
 T = TypeVar("T")
 # Log-likelihood of what is tried, what it takes of further columns, and squares of boards.

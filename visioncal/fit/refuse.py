@@ -5,9 +5,10 @@ Of a session, `estimation.observability` says by which fault of the motion.
 
 import numpy as np
 
+from visioncal.core.directions import edge_directions
 from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray
-from visioncal.estimation.observability import TYPICAL_NOISE, TYPICAL_PX, edge_directions
+from visioncal.estimation.observability import TYPICAL_NOISE, TYPICAL_PX
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import inverse
 from visioncal.model import Cell

@@ -8,8 +8,8 @@ from itertools import chain
 
 import numpy as np
 
+from visioncal.core.transforms import LEVER_M
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.arm import LEVER_M
 from visioncal.fit.candidates import candidates, moved_instead, of_stops, opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_boards, with_held_lenses, with_small_sizes

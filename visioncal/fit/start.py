@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError, DegenerateError
-from visioncal.core.transforms import apply, compose, invert
+from visioncal.core.transforms import apply, compose, distances_m, invert
 from visioncal.core.types import (
     Camera,
     Corners,
@@ -21,7 +21,7 @@ from visioncal.core.types import (
     Target,
     evenly,
 )
-from visioncal.fit.consensus import Candidates, distances_m
+from visioncal.fit.consensus import Candidates
 from visioncal.fit.joining import Network, Relation
 from visioncal.fit.weights import first_weighed, on_planes
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose

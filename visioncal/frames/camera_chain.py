@@ -22,15 +22,15 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
-from visioncal.estimation.arm import pose_basis
-from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge
 from visioncal.results.arm import FUNCTIONS
+from visioncal.robot.errors import pose_basis
+from visioncal.session.frames import edge_names
 from visioncal.vision.camera import intrinsics
 
 # Locating a pixel takes a millisecond; the arm's model is slow to import.
 if TYPE_CHECKING:
-    from visioncal.estimation.armmodel import ArmModel
+    from visioncal.robot.arm_model import ArmModel
 
 # A transform, or its (4, 4) matrix.
 Pose: TypeAlias = FloatArray | RigidTransform

@@ -8,13 +8,13 @@ from typing import Any, cast
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.directions import Direction
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FixtureLimits, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.procrustes import spreads
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
-from visioncal.estimation.observability import Direction
 from visioncal.frames.group_outliers import GroupInliers
 from visioncal.frames.other_tip import with_other_tip
 from visioncal.frames.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.directions import SIGMA_LIMIT_M
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Corners, FloatArray, Image, Target
-from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.frames.camera_chain import (
     CalibratedCamera,
     CameraPose,

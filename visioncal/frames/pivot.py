@@ -21,6 +21,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.directions import SIGMA_LIMIT_M, Direction, Turning
 from visioncal.core.errors import DataError
 from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import figure
@@ -28,7 +29,6 @@ from visioncal.core.robust import small_sets
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, apply_each, compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction, Turning
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups

@@ -6,13 +6,13 @@ from typing import TypeVar
 
 import numpy as np
 
+from visioncal.core.directions import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 from visioncal.estimation.points import GroupFit
 
 # Least noise of any instrument [m]: exact coordinates would otherwise be judged by rounding.

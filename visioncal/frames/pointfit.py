@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from visioncal.core.directions import Direction
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, some_of
@@ -24,7 +25,6 @@ from visioncal.core.quantiles import FALSE_REJECTION, t_chance
 from visioncal.core.robust import SETS, small_sets
 from visioncal.core.transforms import apply, compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.observability import Direction
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.frames.placing import (

@@ -4,8 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.detect import corners_in
-from visioncal.calibration.stages.pnp import ViewPoses, measure_poses
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.linalg import covariance_from
@@ -13,13 +11,16 @@ from visioncal.core.number_format import figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Target
-from visioncal.estimation.appearance import SCALE, Appearance, Compressed, compress, shape_basis
+from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.frames.camera_chain import CalibratedCamera
+from visioncal.vision.board_shape import SCALE, shape_basis
 from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import GREY, poor_image_reason
 from visioncal.vision.corners import CornerStack, reproject
+from visioncal.vision.detection import corners_in
 from visioncal.vision.gating import gate
 from visioncal.vision.lens_field import depths_m, zooms
+from visioncal.vision.pnp import ViewPoses, measure_poses
 from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import corner_positions, rotations
 

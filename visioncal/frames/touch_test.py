@@ -11,11 +11,10 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, listed, rounded_up
-from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
-from visioncal.core.transforms import compose, invert
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, radius95
+from visioncal.core.transforms import compose, invert, point_covariance
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.touches import Tool, robot_noise
 from visioncal.results import Calibration, Edge, Frame

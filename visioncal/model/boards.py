@@ -1,7 +1,7 @@
 """How the corners of a printed board may lie elsewhere than its file says."""
 
 from visioncal.core.types import FloatArray, Target
-from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, loose_basis
+from visioncal.vision.board_shape import ASPECT, SCALE, SHEAR, loose_basis
 
 # Derivatives by size, by aspect and shear, and by seven polynomials of second and third order.
 SIZE, PLANE, BEND = slice(0, 1), slice(1, 3), slice(3, 10)

@@ -7,10 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.types import Mask, Target
-from visioncal.estimation.tree import Tree
 from visioncal.model.arm import Arm, Moments, Swept
 from visioncal.model.sightings import Sighting
 from visioncal.session.document import CameraTable
+from visioncal.session.tree import Tree
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
-from visioncal.estimation.tree import Tree, check_prior
 from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.session.document import Declaration, PriorTable
+from visioncal.session.tree import Tree, check_prior
 
 
 def stated_sightings(

@@ -7,7 +7,6 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.types import Corners, FloatArray
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.model.arm import Arm, Moments, Reported, Swept, even_progress
 from visioncal.model.cell import Cell
 from visioncal.model.heating import recorded_inputs
@@ -19,6 +18,7 @@ from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.frames import CELL
 from visioncal.session.kinds import name_of, stated_instrument
 from visioncal.session.table import loads_of
+from visioncal.session.tree import Branch, Tree
 from visioncal.vision.poses import FEWEST_CORNERS
 
 

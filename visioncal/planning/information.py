@@ -15,16 +15,8 @@ from visioncal.core.linalg import covariance_from, gram
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import adjoint, compose, invert, skew
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
-from visioncal.estimation.appearance import (
-    SCALE,
-    Appearance,
-    LensBoardParameters,
-    compress,
-    shape_basis,
-    stated_board_sigma,
-)
-from visioncal.estimation.arm import ArmErrors, link_basis
-from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
+from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
+from visioncal.estimation.arm import arm_effect
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.fit import Fit
@@ -35,7 +27,10 @@ from visioncal.estimation.problem_parts import Effect, State
 from visioncal.planning.cell import AnyCell, PlanCell, seen_from
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
+from visioncal.robot.arm_model import COMPLIANCE, ArmModel, block_size
+from visioncal.robot.errors import ArmErrors, link_basis
 from visioncal.robot.workspace import postures
+from visioncal.vision.board_shape import SCALE, shape_basis, stated_board_sigma
 from visioncal.vision.camera import intrinsics, project
 from visioncal.vision.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.vision.targets import corner_positions, is_seen_in_part
@@ -418,7 +413,7 @@ def with_arm_errors(
         arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
     if arm is None:
         return problem
-    return problem.with_effects([*problem.effects, arm.effect(problem.robots[0])])
+    return problem.with_effects([*problem.effects, arm_effect(arm, problem.robots[0])])
 
 
 def _effect_information(problem: Problem) -> FloatArray:

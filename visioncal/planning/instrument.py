@@ -17,7 +17,6 @@ from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.chain import chain
 from visioncal.estimation.problem import ANYTHING, Problem
 from visioncal.estimation.problem_parts import Linear, State
@@ -36,6 +35,7 @@ from visioncal.planning.information import (
 from visioncal.planning.path import left_candidates, order_stops
 from visioncal.planning.purposes import Purpose
 from visioncal.planning.visibility import Occlusion
+from visioncal.robot.errors import TWIST_UNITS
 
 # Condition of Phi^T Phi, in mm and mrad, up to which the linear solution is numerically stable.
 STABLE = 1e6

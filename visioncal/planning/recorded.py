@@ -14,7 +14,6 @@ from visioncal.core.linalg import covariance_among
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mount, Progress
-from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise
@@ -22,6 +21,7 @@ from visioncal.estimation.solve import Solution
 from visioncal.estimation.unknowns import EDGE
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.information import RecordedStops
+from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.files import robot_names
 from visioncal.session import Session
 from visioncal.vision.targets import extent_m, first_corners

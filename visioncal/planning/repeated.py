@@ -11,8 +11,8 @@ from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import posture_features
 from visioncal.results import Calibration
+from visioncal.robot.errors import posture_features
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
 

@@ -11,8 +11,8 @@ from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUn
 from jinja2.bccache import Bucket
 
 from visioncal.core.number_format import significant
-from visioncal.estimation.arm import SIGNIFICANT
 from visioncal.present import arms, facts
+from visioncal.robot.errors import SIGNIFICANT
 
 
 def said(name: str, *about: object) -> list[str]:

@@ -11,9 +11,9 @@ from visioncal.core.arguments import typed
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import inverse_right_jacobian, invert, log, pose_difference
 from visioncal.core.types import Camera, FloatArray, Mount
-from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge, VerdictStatus
 from visioncal.results.edge import PoseSigmas
+from visioncal.session.frames import edge_names
 from visioncal.session.selecting import ANY, Choice
 from visioncal.vision.camera import intrinsics
 

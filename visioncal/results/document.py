@@ -19,7 +19,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
-from visioncal.estimation.chain import edge_names
 from visioncal.results.cell import CellResult
 from visioncal.results.conditions import Condition
 from visioncal.results.edge import JointCovariance, StoredEdge
@@ -35,6 +34,7 @@ from visioncal.results.parts import (
 )
 from visioncal.results.sections import BoardResult, CalibrationSections, RigResult
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
+from visioncal.session.frames import edge_names
 
 if TYPE_CHECKING:
     from visioncal.results.result import Calibration

@@ -17,11 +17,10 @@ from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.number_format import figure
+from visioncal.core.quantiles import freedom_of
 from visioncal.core.summaries import ByName, html_card, text_card
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Remedy, Verdict
-from visioncal.estimation.chain import edge_names
-from visioncal.estimation.intervals import freedom_of
 from visioncal.results.arm import NOMINAL, ArmResult, ArmSections
 from visioncal.results.cell import CellResult
 from visioncal.results.conditions import Condition, conditions_of
@@ -37,7 +36,7 @@ from visioncal.results.views import Rms, Validation, ViewResult
 from visioncal.robot import Loads, Robot
 from visioncal.robot.elasticity import deflected_joints
 from visioncal.robot.thermal import ThermalModel
-from visioncal.session.frames import CELL, frames_of_kind, object_name
+from visioncal.session.frames import CELL, edge_names, frames_of_kind, object_name
 from visioncal.session.selecting import PARTS, Choice, Part
 
 if TYPE_CHECKING:

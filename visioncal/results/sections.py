@@ -8,10 +8,10 @@ import numpy as np
 
 from visioncal.core.codec import REST, Array, Matrix, Section, Vector
 from visioncal.core.types import FloatArray, Mask, Target
-from visioncal.estimation.appearance import BOARD_NAMES, shaped_corners
 from visioncal.estimation.effects.rolling_shutter import Shutter
 from visioncal.results.arm import ArmSections
 from visioncal.results.edge import Covariance
+from visioncal.vision.board_shape import BOARD_NAMES, shaped_corners
 
 _BEND = "bow_"
 # 95 % intervals by name of the noise level.

@@ -10,10 +10,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.tree import Branch, PathStep, Tree
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.session.frames import CELL
+from visioncal.session.tree import Branch, PathStep, Tree
 
 
 @dataclass(frozen=True, eq=False)

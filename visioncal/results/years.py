@@ -13,9 +13,9 @@ from datetime import datetime, timedelta
 import numpy as np
 from scipy.special import expit, logsumexp
 
+from visioncal.core.quantiles import radius95
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.budget import radius95
 from visioncal.results.history import Entry
 
 # Factors of an entry's covariance, with their probabilities; sizes in the values' units.

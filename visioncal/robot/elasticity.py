@@ -99,3 +99,10 @@ class WeightFunctions:
             rows.append(part @ np.asarray(values)[at : at + part.shape[1]])
             at += part.shape[1]
         return np.array(rows)
+
+
+def weight_words(robot: Robot) -> str:
+    """Where the deflection by the links' own weight comes from."""
+    if robot.weight_compensated:
+        return "compensated by the controller"
+    return "unknown" if robot.masses is None else "of the model's masses"

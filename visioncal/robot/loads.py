@@ -205,3 +205,11 @@ class DriveLimits:
             }
             for row in columns
         ]
+
+
+def load_ranges(loads: Loads) -> dict[str, Any]:
+    """Smallest and largest payload [kg] and, where there is one, force [N]."""
+    force = np.linalg.norm(loads.force_n, axis=1)
+    kg = (float(loads.payload_kg.min()), float(loads.payload_kg.max()))
+    stated = {"force_n": (float(force.min()), float(force.max()))} if force.any() else {}
+    return {"payload_kg": kg, **stated}

@@ -391,3 +391,8 @@ class Robot:
                 culprits=[self.name],
             )
         return values
+
+
+def joint_words(joint: int, robot: Robot) -> str:
+    """A joint by its number and its name."""
+    return f"joint {joint + 1} ({robot.joint_names[joint]})"

@@ -11,6 +11,7 @@ from functools import cached_property
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.types import Mount
 from visioncal.session.document import Declaration, Kind, RobotTable
 from visioncal.session.kinds import (
     has_robot_state,
@@ -278,3 +279,12 @@ def _contradiction(words: str, frame: str, next_step: str = "") -> DataError:
         culprits=[f"{_WHERE}.{frame}"],
         next_step=next_step or "Correct [frames].",
     )
+
+
+def edge_names(mount: Mount) -> tuple[str, str]:
+    """Names of the edges of the camera and of a single target."""
+    if mount == "instrument":
+        return "base_from_instrument", "flange_from_probe"
+    if mount == "eye-in-hand":
+        return "flange_from_cam", "base_from_target"
+    return "base_from_cam", "flange_from_target"

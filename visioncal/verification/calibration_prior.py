@@ -8,23 +8,19 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Target
-from visioncal.estimation.appearance import (
-    Appearance,
-    LensBoardParameters,
-    boards_basis,
-    stated_board_sigma,
-)
-from visioncal.estimation.arm import posture_correlation
-from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.chain import edge_names
+from visioncal.estimation.appearance import Appearance, LensBoardParameters
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.results import Calibration
 from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import FittedArm, JointFit
 from visioncal.robot import Robot
+from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.elasticity import WeightFunctions
+from visioncal.robot.errors import posture_correlation
+from visioncal.session.frames import edge_names
 from visioncal.verification.model_evidence import CalibrationPosterior, RepeatedStops
+from visioncal.vision.board_shape import boards_basis, stated_board_sigma
 from visioncal.vision.targets import numbered_positions, target_from_document
 
 # Correlation of the arm's errors from which a stop repeats a calibrated one.

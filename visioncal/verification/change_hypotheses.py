@@ -8,8 +8,8 @@ import numpy as np
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import TURN_PER_M
-from visioncal.estimation.armmodel import ArmModel
+from visioncal.robot.arm_model import ArmModel
+from visioncal.robot.errors import TURN_PER_M
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.model_evidence import ChangeHypothesis
 from visioncal.verification.prediction import PredictedStops, board_changes

@@ -7,20 +7,19 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from visioncal.calibration.stages.corner_numbers import far_outside
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.core.arguments import check_fields, typed
 from visioncal.core.codec import within
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
-from visioncal.core.transforms import invert, rigid_fault
+from visioncal.core.transforms import invert, rigid_fault, robot_part
 from visioncal.core.types import Corners, FloatArray
-from visioncal.estimation.arm import TURN_PER_M, ArmErrors, link_basis, posture_features
-from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.arm import arm_effect
+from visioncal.estimation.chain import chain
 from visioncal.estimation.problem_parts import ROBOT, Effect
 from visioncal.results import Calibration
+from visioncal.robot.arm_model import ArmModel
+from visioncal.robot.errors import TURN_PER_M, ArmErrors, link_basis, posture_features
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.change_hypotheses import BOARD, CAMERA, JOINT, MOTION_UNITS
 from visioncal.verification.guard_detector import (
@@ -35,7 +34,8 @@ from visioncal.verification.guard_detector import (
     step,
     weighed,
 )
-from visioncal.vision.corners import CornerStack, reproject
+from visioncal.vision.corners import CornerStack, far_outside, reproject
+from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import first_corners
 
@@ -316,7 +316,7 @@ class Guard:
                 robot, is_of_links = self._arm.robot, fitted.of == "links"
                 basis = link_basis(robot, joints) if is_of_links else self._arm.basis(joints)
                 errors = ArmErrors(basis, 1.0, np.inf, of_links=True)
-                effects = [errors.effect(ROBOT, values=np.zeros(basis.shape[2]))]
+                effects = [arm_effect(errors, ROBOT, values=np.zeros(basis.shape[2]))]
         flange = np.eye(4) if flange is None else flange
         pose, covariance = self._posed(look, board, flange, label), None
         if self._free is not None:

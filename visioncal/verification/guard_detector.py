@@ -33,8 +33,9 @@ from hashlib import sha256
 import numpy as np
 
 from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import LEVER_M
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import LEVER_M, SIZES_M
+from visioncal.robot.errors import SIZES_M
 
 # Candidates for the look of the change, and the looks after which one is given up.
 _CANDIDATES, _OLDEST = 14, 1000

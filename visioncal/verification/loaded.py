@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.calibration.stages.elastic import BENDS, load_ranges, weight_words
+from visioncal.calibration.stages.elastic import BENDS
 from visioncal.calibration.stages.readings import read_instrument, stops_of_views
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CONTRADICTION, DETERMINED
@@ -19,10 +19,12 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import NOTE, Finding, Remedy
-from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
 from visioncal.results import Calibration
 from visioncal.results.arm import ElasticResult, JointSpring, Sag
 from visioncal.robot import Loads
+from visioncal.robot.arm_model import COMPLIANCE, ArmModel
+from visioncal.robot.elasticity import weight_words
+from visioncal.robot.loads import load_ranges
 from visioncal.session import Session
 from visioncal.session.table import loads_of
 from visioncal.verification.calibration_prior import CalibrationPrior

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.directions import axis_words
 from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed, view_words
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
@@ -20,8 +21,7 @@ from visioncal.core.verdict import (
     Remedy,
     Verdict,
 )
-from visioncal.estimation.identifiability import joint_words
-from visioncal.estimation.observability import axis_words
+from visioncal.robot.model import joint_words
 from visioncal.verification.change_hypotheses import (
     BOARD,
     BOTH,

@@ -27,10 +27,10 @@ from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import SIZES_M
 from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.robot.errors import SIZES_M
 
 # Shares of the noise's variance that are new at a repeated posture: sigmas are halved in each step.
 _NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))

@@ -12,15 +12,14 @@ from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, listed
-from visioncal.core.transforms import invert, log
+from visioncal.core.transforms import invert, log, robot_part
 from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
-from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.chain import robot_part
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.results import CameraResult
 from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
+from visioncal.robot.errors import ArmErrors
 from visioncal.session import Session
 from visioncal.session.kinds import COLUMN
 from visioncal.verification.calibration_prior import CalibrationPrior

@@ -22,15 +22,15 @@ from visioncal.core.number_format import counted, listed, mm_and_deg
 from visioncal.core.transforms import adjoint, exp, invert, log, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, remarks
-from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.results import Calibration, Edge, Rms, Validation, ViewResult
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult
 from visioncal.results.sections import FittedArm, FittedStops, NoiseIntervals
 from visioncal.results.views import rms_of
+from visioncal.robot.arm_model import ArmModel
 from visioncal.session import Session
+from visioncal.session.frames import edge_names
 from visioncal.verification.change_hypotheses import BOARD, BOTH, CAMERA, JOINT, nominal_model
 from visioncal.verification.check import Check, PossibleChange, verify
 from visioncal.verification.messages import change_words

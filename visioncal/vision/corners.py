@@ -23,6 +23,8 @@ from visioncal.vision.viewnoise import weights_by_view
 _ROUNDED = 1.3
 # Corners whose modes of a field are held at once.
 _BLOCK = 2048
+# Distance outside the image from which on corners are none, as a share of its size.
+_OUTSIDE = 0.1
 # Exact corners have no noise; a millionth of a pixel keeps their covariance positive definite.
 _LEAST_SIGMA_PX = 1e-6
 
@@ -380,3 +382,9 @@ def reproject(
 def mean_square_by_view(stack: CornerStack, residuals: FloatArray) -> FloatArray:
     """Mean squared residual of each view's corners, (v,) [px^2]."""
     return stack.sum_by_view(np.sum(residuals**2, axis=1)) / stack.counts
+
+
+def far_outside(px: FloatArray, resolution: tuple[int, int]) -> Mask:
+    """(n,) whether each of (n, 2) pixels is none of an image of (width, height), nor near it."""
+    shares = px / np.array(resolution, dtype=float)
+    return np.asarray(~((shares >= -_OUTSIDE) & (shares <= 1.0 + _OUTSIDE)).all(axis=1))

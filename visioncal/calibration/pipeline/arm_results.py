@@ -14,7 +14,7 @@ from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.thermal import LEVEL
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import ArmErrors, covariance_of_size
+from visioncal.estimation.arm import covariance_of_size
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import expected_levels
@@ -22,6 +22,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 from visioncal.estimation.unknowns import ARM
+from visioncal.robot.errors import ArmErrors
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
 STEP = "what moved at once"

@@ -23,7 +23,6 @@ from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.likely_steps import steps_of, with_free_sizes
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
 from visioncal.calibration.suspects.moved_views import PoseFault
 from visioncal.calibration.suspects.outliers import (
@@ -46,6 +45,7 @@ from visioncal.estimation.unknowns import EDGE, LENS, Unknown
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.sections import ClockResult, Intervals
 from visioncal.vision.corners import CornerStack
+from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.poses import fit_poses
 
 _T = TypeVar("_T")

@@ -7,17 +7,18 @@ from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.stages.validate import HeldOutResiduals, needed_frames, pose_residuals
+from visioncal.core.directions import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.core.quantiles import radius95
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import apply_each
+from visioncal.core.transforms import apply_each, point_covariance
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.appearance import shape_basis
-from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
+from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.solve import solve_without
 from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE
 from visioncal.results.sections import UncertaintyResult
 from visioncal.session import Session
+from visioncal.vision.board_shape import shape_basis
 from visioncal.vision.targets import corner_positions
 
 # Sources of a single pair that are not clocks.

@@ -24,13 +24,14 @@ from visioncal.calibration.suspects.misread_poses import misreadings, turned_boa
 from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.rounded_poses import rounded
 from visioncal.core.arguments import typed
+from visioncal.core.directions import Turning
 from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, mm_and_deg, row_words, some_of, view_words
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, of_cell, with_paths
-from visioncal.estimation.observability import Turning, check_determined
+from visioncal.estimation.observability import check_determined
 from visioncal.estimation.solve import starting_noise
 from visioncal.robot.model import REPEATABILITY
 from visioncal.session import Session

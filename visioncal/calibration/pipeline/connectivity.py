@@ -5,11 +5,11 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.core.directions import Turning
 from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
-from visioncal.estimation.observability import Turning
 
 
 def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:

@@ -13,16 +13,15 @@ from visioncal.calibration.guess.search import in_one_turn, turns_alike
 from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.observed import CameraObservations
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
-from visioncal.core.transforms import compose
+from visioncal.core.transforms import compose, robot_part
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Mount
-from visioncal.estimation.chain import robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.session.frames import object_name
+from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.targets import first_numbers
 
 

@@ -8,10 +8,9 @@ import numpy as np
 from visioncal.calibration.pipeline.starting import Start, sensors_of
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.error_sizes import scales_of
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
 from visioncal.calibration.stages.refine import PRINTED_SCALE
-from visioncal.estimation.arm import LEVER_M
+from visioncal.core.transforms import LEVER_M
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.moves import Creep, creep_effects
@@ -28,6 +27,7 @@ from visioncal.estimation.solve import (
     solve_problem,
 )
 from visioncal.model.effects import FrameCreeps
+from visioncal.vision.pnp import ViewPoses
 
 
 def initial_inliers(start: Start) -> InlierFit:

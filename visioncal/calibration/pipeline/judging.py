@@ -19,27 +19,25 @@ from visioncal.calibration.suspects.outliers import EXCHANGED
 from visioncal.calibration.suspects.registry import found_in
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.core.conventions import controller_form
+from visioncal.core.directions import Direction, Turning, edge_directions
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of, view_words
+from visioncal.core.quantiles import freedom_of
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding, Remedy, Verdict, of_cell
 from visioncal.estimation.arm import stops_of
-from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
     CellWords,
-    Direction,
-    Turning,
     chain_words,
     check_determined,
     directions,
-    edge_directions,
     too_little_motion,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.tree import Tree
 from visioncal.estimation.unknowns import LENS
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 from visioncal.robot.model import REPEATABILITY
+from visioncal.session.tree import Tree
 
 
 def judge_run(state: RunState) -> RunState:

@@ -9,13 +9,14 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.core.types import IntArray
 from visioncal.estimation.appearance import LensBoardParameters
-from visioncal.estimation.chain import chain, edge_names
+from visioncal.estimation.chain import chain
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT
+from visioncal.session.frames import edge_names
+from visioncal.vision.pnp import ViewPoses
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,6 @@ from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.random_effects import of_random_effects
 from visioncal.core.transforms import apply, log
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.appearance import BOARD_NAMES, shaped_corners
-from visioncal.estimation.armmodel import HARMONICS
-from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.unknowns import ARM, BOARD, EDGE, LENS, SIZE
 from visioncal.results import (
@@ -52,8 +49,10 @@ from visioncal.results.sections import (
 )
 from visioncal.results.views import rms_of
 from visioncal.robot import Robot
+from visioncal.robot.arm_model import HARMONICS
 from visioncal.session import frame_name
-from visioncal.session.frames import CELL, object_name
+from visioncal.session.frames import CELL, edge_names, object_name
+from visioncal.vision.board_shape import BOARD_NAMES, shaped_corners
 from visioncal.vision.camera import project
 from visioncal.vision.targets import first_corners, target_document
 

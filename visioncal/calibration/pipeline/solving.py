@@ -28,7 +28,6 @@ from visioncal.calibration.stages.error_sizes import (
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.random_effects import random_effects
 from visioncal.calibration.stages.refine import refine_jointly
 from visioncal.calibration.suspects.moved_views import views_apart
@@ -57,6 +56,7 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, joints_of
 from visioncal.estimation.unknowns import SIZE
+from visioncal.vision.pnp import ViewPoses
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.

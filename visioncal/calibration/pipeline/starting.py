@@ -14,7 +14,6 @@ from visioncal.calibration.pipeline.connectivity import ambiguous_error, refuse_
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.error_sizes import scales_of, session_start
 from visioncal.calibration.stages.observed import Observed, nothing_seen
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import FloatArray, Mask, Target
@@ -24,6 +23,7 @@ from visioncal.estimation.problem_parts import Observations, State
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.solve import CellFit, solve_from
 from visioncal.model.effects import Play
+from visioncal.vision.pnp import ViewPoses
 
 # Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)

@@ -12,13 +12,11 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.armmodel import RIGID
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
     is_linear_zero,
-    joint_words,
     observability_indices,
     parameter_words,
     undetermined,
@@ -35,7 +33,9 @@ from visioncal.results.arm import (
     WorkspaceSigma,
 )
 from visioncal.robot import Robot
+from visioncal.robot.arm_model import RIGID
 from visioncal.robot.conversion import convert_table, parallel_axes, table_of
+from visioncal.robot.model import joint_words
 from visioncal.robot.tables import DHTable, table_from_document
 from visioncal.robot.workspace import postures
 

@@ -18,19 +18,10 @@ from visioncal.calibration.stages.thermal import (
 )
 from visioncal.core.choices import Convention
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import distances, invert, mean_transform
+from visioncal.core.transforms import LEVER_M, distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.arm import (
-    LEVER_M,
-    ArmErrors,
-    find_arm_errors,
-    link_basis,
-    pose_basis,
-    rows_of,
-    stops_of,
-)
+from visioncal.estimation.arm import arm_effect, find_arm_errors, rows_of, stops_of
 from visioncal.estimation.arm_sizes import most_orders
-from visioncal.estimation.armmodel import HARMONICS, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Problem
@@ -40,6 +31,8 @@ from visioncal.estimation.unknowns import ARM, EDGE
 from visioncal.model.arm import sides_of_motion
 from visioncal.results.arm import ArmErrorsResult, ArmSections
 from visioncal.robot import Loads, Robot
+from visioncal.robot.arm_model import HARMONICS, ArmModel, blocks_of
+from visioncal.robot.errors import ArmErrors, link_basis, pose_basis
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
 
@@ -156,7 +149,7 @@ class RobotArm:
             found.append(drift.effect(self.robot, self.heat, self.has_pose))
         if self.errors is not None and self.errors.is_estimated:
             values = None if self.model is None else self.model.values
-            found.append(self.errors.effect(self.robot, values=values))
+            found.append(arm_effect(self.errors, self.robot, values=values))
         return tuple(found)
 
     def applied_to(self, problem: Problem) -> Problem:

@@ -19,8 +19,8 @@ from visioncal.core.number_format import figure, ranges
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Target, evenly
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.appearance import SCALE, board_basis
 from visioncal.fit.lens_field import orders_of_waves, waves
+from visioncal.vision.board_shape import SCALE, board_basis
 from visioncal.vision.corners import (
     CornerStack,
     Reprojection,

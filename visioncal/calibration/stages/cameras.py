@@ -18,7 +18,6 @@ from visioncal.calibration.stages.detect import (
 )
 from visioncal.calibration.stages.error_sizes import solve_session
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
-from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
@@ -28,10 +27,12 @@ from visioncal.core.verdict import Finding, mending
 from visioncal.results import CameraResult
 from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
+from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
+from visioncal.vision.pnp import Poses, ViewPoses, estimate_poses, measure_poses
 from visioncal.vision.targets import first_numbers
 
 T = TypeVar("T", bound=Observed)
@@ -429,3 +430,22 @@ def _naming(seen: Observed, frame: str) -> Iterator[None]:
         if len(seen.session.cameras) < 2:
             raise
         raise error.within(frame) from error
+
+
+def stated_poses(session: Session) -> dict[int, ViewPoses]:
+    """Collects the poses that the session states itself (`cft_` columns), by view."""
+    boards = {name: at for at, name in enumerate(session.boards)}
+    given = ((view, view.matrix(MEASURED_CAM_POSE)) for view in session.views)
+    return {
+        view.number: ViewPoses(
+            view.number,
+            None,
+            pose[None],
+            (0,),
+            np.zeros((1, 6, 6)),
+            np.zeros((1, 6, 0)),
+            boards.get(session.board_of(view), 0),
+        )
+        for view, pose in given
+        if pose is not None
+    }

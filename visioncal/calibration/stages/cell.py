@@ -10,14 +10,14 @@ from visioncal.calibration.stages.priors import prior_of
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Remedy, or_alone
-from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import FramePrior
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.results import HELD_BACK
 from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.document import PriorTable
+from visioncal.session.frames import edge_names
 from visioncal.session.kinds import has_robot_state, is_camera_observation, name_of
 from visioncal.session.selecting import is_whole_cell
+from visioncal.session.tree import Branch, Tree
 
 _CELL = "cell"
 

@@ -11,12 +11,10 @@ import numpy as np
 from visioncal.calibration.stages.arms import RobotArm, arm_effects, with_link_errors
 from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.error_sizes import ErrorSizes
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import apply, pose_difference
 from visioncal.core.types import Corners, FloatArray, IntArray
-from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.outliers import InlierFit
@@ -24,6 +22,8 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
 from visioncal.estimation.unknowns import BOARD
+from visioncal.vision.board_shape import SCALE
+from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.targets import corner_positions
 
 # An arm without joint angles may look like a step of a frame.

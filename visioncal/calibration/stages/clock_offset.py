@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from visioncal.calibration.stages.motion import RobotMotion
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import CONTRADICTION, FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg
@@ -17,6 +15,8 @@ from visioncal.estimation.clock_correlation import WIDEST_OFFSET_S, Match
 from visioncal.results.sections import ClockResult
 from visioncal.robot.trajectory import LONGEST_GAP_S
 from visioncal.session import View, too_far_apart
+from visioncal.session.motion import RobotMotion
+from visioncal.vision.pnp import ViewPoses
 
 # Least correlation of turning angles of the same motion; largest sigma of a usable offset [s].
 LEAST_CORRELATION, LARGEST_SIGMA_S = 0.5, 0.01

@@ -25,16 +25,7 @@ from visioncal.calibration.stages.clock_offset import (
     undetermined_error,
     why_undetermined,
 )
-from visioncal.calibration.stages.motion import (
-    RobotMotion,
-    is_standing_still,
-    lacks_robot_state,
-    motion_of,
-    slow_and_new,
-    stream_of,
-)
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.linalg import covariance_from
@@ -57,8 +48,17 @@ from visioncal.results.sections import ClockResult
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import is_camera_observation
+from visioncal.session.motion import (
+    RobotMotion,
+    is_standing_still,
+    lacks_robot_state,
+    motion_of,
+    slow_and_new,
+    stream_of,
+)
 from visioncal.vision.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.vision.intrinsics import estimate_intrinsics
+from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.targets import numbered_positions
 
 T = TypeVar("T", bound=Observed)

@@ -18,7 +18,9 @@ from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import Corners, FloatArray, Mask, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
-from visioncal.vision.poses import FEWEST_CORNERS, determines_pose
+from visioncal.vision.corners import far_outside
+from visioncal.vision.detection import lack_of_corners
+from visioncal.vision.poses import FEWEST_CORNERS
 from visioncal.vision.targets import corner_positions, otherwise, point_numbers
 
 EXCHANGE_COLUMNS = Remedy(
@@ -30,8 +32,6 @@ EXCHANGE_COLUMNS = Remedy(
 _MOST_LEFT = 0.3
 # Such a share of a board with the right counts, and columns and rows that are tried.
 _LIKE, _MOST_COUNT = 0.05, 41
-# Distance outside the image from which on corners are none, as a share of its size.
-_OUTSIDE = 0.1
 # Distance outside the image that neither noise nor the half pixel of another origin explains [px],
 # and the least share of a view's corners so far out.
 _WELL_OUTSIDE_PX, _LEAST_OUTSIDE = 5.0, 0.05
@@ -113,12 +113,6 @@ def are_exchanged(
     return bool(CLEAR_RATIO * there < here)
 
 
-def far_outside(px: FloatArray, resolution: tuple[int, int]) -> Mask:
-    """(n,) whether each of (n, 2) pixels is none of an image of (width, height), nor near it."""
-    shares = px / np.array(resolution, dtype=float)
-    return np.asarray(~((shares >= -_OUTSIDE) & (shares <= 1.0 + _OUTSIDE)).all(axis=1))
-
-
 def _usable(
     corners: Corners, target: Target, outside: Mask, resolution: tuple[int, int]
 ) -> Corners | Rejection:
@@ -131,16 +125,6 @@ def _usable(
             f"{v_px:g}) px lies far outside the image of {resolution[0]} x {resolution[1]} px"
         )
     return Rejection(corners.view, reason) if reason else corners
-
-
-def lack_of_corners(corners: Corners, target: Target, needed: int) -> str:
-    """Why a view's corners determine no pose; empty where they do."""
-    positions, count = corner_positions(target), len(corners.ids)
-    if count < needed:
-        return f"too few corners: {count} of {len(positions)}, needs {needed}"
-    if not determines_pose(positions[corners.ids]):
-        return f"corners on one line: all {count}, or all but one, lie in one row of the target"
-    return ""
 
 
 def _misnumbered(session: Session, name: str, views: Sequence[Corners]) -> list[int]:

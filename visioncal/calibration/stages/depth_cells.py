@@ -12,12 +12,12 @@ from visioncal.core.number_format import counted
 from visioncal.core.quantiles import SIGMA_PER_MAD
 from visioncal.core.transforms import adjoint, apply, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Mask, chosen_rows
-from visioncal.estimation.appearance import shape_basis
 from visioncal.results import Calibration, CameraResult
 from visioncal.results.depth import DepthCamera, bending
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View
 from visioncal.session.depth import read_depth
+from visioncal.vision.board_shape import shape_basis
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject

@@ -6,14 +6,13 @@ Corners that another detector found (corners.csv) are used as they are.
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 
 import cv2
 import numpy as np
 
-from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_corners
+from visioncal.calibration.stages.corner_numbers import usable_corners
 from visioncal.calibration.stages.other_board import (
     LOOKED_AT,
     LOOKED_AT_LAST,
@@ -24,21 +23,18 @@ from visioncal.calibration.stages.other_board import (
     spread,
 )
 from visioncal.core.errors import DataError
-from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.number_format import ranges
-from visioncal.core.threads import SharedSetting
 from visioncal.core.types import Corners, Image, Progress, Rejection, Searched, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
-from visioncal.vision.boards import NotFound, find_target, kind_of
+from visioncal.vision.boards import NotFound, kind_of
 from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.imaging import (
-    blur_at_corners,
     decode_image,
     faint_jpeg,
-    poor_image_reason,
 )
+from visioncal.vision.detection import ONE_OPENCV_THREAD, find_corners
 from visioncal.vision.targets import corner_positions
 
 Size = tuple[int, int]
@@ -297,20 +293,6 @@ def _of_size(view: View, searched: Searched, size: Size) -> Searched:
     return Searched(Rejection(view.number, words), None)
 
 
-@contextmanager
-def _one_opencv_thread() -> Iterator[None]:
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
-
-
-# OpenCV's own threads inside these would slow both down.
-ONE_OPENCV_THREAD = SharedSetting(_one_opencv_thread)
-
-
 def image_of(session: Session, view: View) -> Image | Rejection:
     """Reads a view's (h, w) grey image; a rejection where there is none."""
     if absence := session.images.absence(view.image):
@@ -331,43 +313,6 @@ def _search(session: Session, view: View, *, picture: bool) -> Searched:
     found, misfit = find_corners(image, session.boards[name], view.number, name=name)
     faint = faint_jpeg(image) if picture else None
     return Searched(found, (image.shape[1], image.shape[0]), misfit, faint)
-
-
-def corners_in(image: Image, target: Target, view: int = 0) -> Corners | NotFound:
-    """Finds a target's corners in an (h, w) grey image, with their blur; see `find_target`."""
-    seen = find_target(image, target)
-    if isinstance(seen, NotFound):
-        return seen
-    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
-    return Corners(view, seen.ids, seen.px, blur, seen.weights, drawn_m=seen.drawn_m)
-
-
-def find_corners(
-    image: Image, target: Target, view: int, *, name: str = ""
-) -> tuple[Corners | Rejection, bool]:
-    """Finds a target in one image.
-
-    Args:
-        image: (h, w) grey image.
-        target: The target.
-        view: The view's number.
-        name: Name of the target in the session, where it has several.
-
-    Returns:
-        The corners, or why the view is rejected; and whether markers were seen in another layout
-        than the target's.
-    """
-    seen = corners_in(image, target, view)
-    if isinstance(seen, NotFound):
-        cause = poor_image_reason(image, MAX_BLUR_PX)
-        reason = f"{seen.reason}; {cause}" if cause else seen.reason
-        reason = f"{reason} (looked for target {name})" if name else reason
-        return Rejection(view, reason), seen.misfit
-    needed = min(kind_of(target).fewest, len(corner_positions(target)))
-    reason = lack_of_corners(seen, target, needed)
-    if not reason and seen.blur_px > MAX_BLUR_PX:
-        reason = f"blurred: edges are {seen.blur_px:.1f} px wide (limit {MAX_BLUR_PX:.1f})"
-    return (Rejection(view, reason) if reason else seen), False
 
 
 def _check_layout(target: Target, searches: Mapping[int, Searched]) -> None:

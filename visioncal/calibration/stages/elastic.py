@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -10,13 +9,14 @@ from visioncal.core.limits import CONTRADICTION, DETERMINED
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, Remedy
-from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag, TwoSlopes
-from visioncal.robot import Loads, Robot
+from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
+from visioncal.robot.elasticity import weight_words
+from visioncal.robot.errors import ArmErrors
+from visioncal.robot.loads import load_ranges
 
 
 def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult | None:
@@ -66,21 +66,6 @@ def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult |
         weight_moments=model.moments,
         payload_factor=_payload_factor(arm),
     )
-
-
-def weight_words(robot: Robot) -> str:
-    """Where the deflection by the links' own weight comes from."""
-    if robot.weight_compensated:
-        return "compensated by the controller"
-    return "unknown" if robot.masses is None else "of the model's masses"
-
-
-def load_ranges(loads: Loads) -> dict[str, Any]:
-    """Smallest and largest payload [kg] and, where there is one, force [N]."""
-    force = np.linalg.norm(loads.force_n, axis=1)
-    kg = (float(loads.payload_kg.min()), float(loads.payload_kg.max()))
-    stated = {"force_n": (float(force.min()), float(force.max()))} if force.any() else {}
-    return {"payload_kg": kg, **stated}
 
 
 # Prior of a joint's bend by a load beyond that as stated: a gear of 10 kN m/rad [rad/(N m)]; and

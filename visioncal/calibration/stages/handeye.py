@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from visioncal.core.transforms import invert
+from visioncal.core.transforms import invert, robot_part
 from visioncal.core.types import Mount
-from visioncal.estimation.chain import robot_part, scatter
+from visioncal.estimation.chain import scatter
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State

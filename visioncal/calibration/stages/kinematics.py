@@ -12,20 +12,14 @@ from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.arm import ArmErrors, rows_of, stops_of
+from visioncal.estimation.arm import arm_effect, rows_of, stops_of
 from visioncal.estimation.arm_sizes import ArmSizes, estimate_arm_sizes
-from visioncal.estimation.armmodel import (
-    BACKLASH,
-    COMPLIANCE,
-    HARMONICS,
-    RIGID,
-    WEIGHT,
-    JointFunctions,
-)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals
 from visioncal.results.arm import FUNCTIONS, NOMINAL, ArmLevel, ArmResult, UnseenView
+from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, HARMONICS, RIGID, WEIGHT, JointFunctions
+from visioncal.robot.errors import ArmErrors
 
 # The blocks of errors by what the user asks for: the quick one after a lost encoder, or all that
 # the data determine.
@@ -70,7 +64,7 @@ class LevelFit:
         """Fits all unknowns with errors of some sizes; the nominal arm where `sizes` is None."""
         errors = {} if sizes is None else sizes.errors
         if sizes is not None:
-            effects = [error.effect(robot, name) for name, error in errors.items()]
+            effects = [arm_effect(error, robot, name) for name, error in errors.items()]
             problem = problem.with_effects([*problem.effects, *effects])
             noise = replace(noise, robots=sizes.levels)
         values = np.append(state.values, problem.start_values[len(state.values) :])

@@ -9,8 +9,7 @@ from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.types import FloatArray
-from visioncal.estimation.appearance import SCALE
-from visioncal.estimation.arm import ArmErrors, stops_of
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.moves import still_frames
@@ -30,6 +29,8 @@ from visioncal.estimation.steps import (
     twice,
 )
 from visioncal.estimation.unknowns import BOARD, SIZE
+from visioncal.robot.errors import ArmErrors
+from visioncal.vision.board_shape import SCALE
 
 # Most steps that are fitted.
 _MOST_FITTED = 6

@@ -43,10 +43,10 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.tolerance_probability import chance_within, radius_within
 from visioncal.core.transforms import adjoint, apply_each, compose, invert, log
 from visioncal.core.types import FloatArray, IntArray, Need
-from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.fit import Closure, Fit
 from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.results import NeedMet, Picker
+from visioncal.robot.errors import ArmErrors
 from visioncal.session.frames import object_name
 
 # Source of what a calibrated arm misses by the controller's own poses.

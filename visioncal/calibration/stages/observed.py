@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Self
 
 from visioncal.calibration.stages.clock_offset import ClockedViews, ClockPair
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
@@ -18,6 +17,7 @@ from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.document import CameraTable
+from visioncal.vision.pnp import ViewPoses
 
 # Views of one reason that are listed.
 _LISTED = 40

@@ -17,10 +17,10 @@ from dataclasses import replace
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.transforms import invert
 from visioncal.core.types import CameraMount
-from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.session.columns import INSTRUMENT_POSITION, POSE, pose_row
+from visioncal.session.frames import edge_names
 from visioncal.session.table import reported_matrices
 
 _OTHERS = ("camera", "cameras", "mount", "target", "targets", "robot", "robots", "frames", "prior")

@@ -14,13 +14,14 @@ import numpy as np
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.linalg import ROUNDING, gram
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import ArmErrors, stops_of
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.mixed import LEAST_SIGMA
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.fit.kernels import Process, StopErrors, processes
 from visioncal.fit.processes import weigh
+from visioncal.robot.errors import ArmErrors
 
 # Least share of a model's evidence, and most columns that represent the errors of all stops; the
 # remainder counts as noise.

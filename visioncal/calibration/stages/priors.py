@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.directions import SIGMA_LIMIT_M
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import figure
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.problem_parts import FramePrior
-from visioncal.estimation.tree import Tree, check_prior
 from visioncal.session.document import PriorTable
+from visioncal.session.tree import Tree, check_prior
 
 _AXES = ("x_m", "y_m", "z_m")
 # Prior sigma of a position that is overruled by any estimate that is accepted [m].

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration.stages.observed import Observed, nothing_seen
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted, did_you_mean, some_of
 from visioncal.core.procrustes import align
@@ -21,6 +20,7 @@ from visioncal.session.kinds import (
     name_of,
     stated_instrument,
 )
+from visioncal.vision.pnp import ViewPoses
 
 # Largest distance that a tracker reads [m].
 _FARTHEST_M = 160.0

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.cell_fit import CellFit
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
 from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
@@ -18,6 +17,7 @@ from visioncal.estimation.joint import (
     others_of,
 )
 from visioncal.vision.corners import CornerStack, floored_sigma_px
+from visioncal.vision.pnp import ViewPoses
 
 # Prior sigma of a printed board's scale, as a share: prints are scaled to fit a page.
 PRINTED_SCALE = 0.03

@@ -9,9 +9,7 @@ import numpy as np
 from visioncal.calibration.guess.fit import distances
 from visioncal.calibration.guess.joints import JointGuess, guess_joints
 from visioncal.calibration.stages.joints import MatchedJoints
-from visioncal.calibration.stages.motion import lacks_robot_state
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import RobotReport, reported_poses
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_COMPARED
@@ -21,7 +19,9 @@ from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.kinds import is_camera_observation, name_of
+from visioncal.session.motion import lacks_robot_state
 from visioncal.session.table import loads_of
+from visioncal.vision.pnp import ViewPoses
 
 T = TypeVar("T", bound=Observed)
 

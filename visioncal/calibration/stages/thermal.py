@@ -19,8 +19,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors, rows_of
-from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.arm import arm_effect, find_arm_errors, rows_of
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
@@ -38,6 +37,8 @@ from visioncal.model.heating import (
 )
 from visioncal.results.arm import DriftPoint, DriftResidual, JointDrift, ThermalResult, ViewDrift
 from visioncal.robot import Robot
+from visioncal.robot.arm_model import ArmModel
+from visioncal.robot.errors import SIGNIFICANT
 from visioncal.robot.thermal import Inputs, ThermalModel
 from visioncal.session import Session
 from visioncal.session.observations import APART_RAD
@@ -229,7 +230,7 @@ def find_drift(
         likelihood = robot_likelihood(problem, start, starting_noise(problem))
         links = find_arm_errors(likelihood, problem.robots.index(robot), basis)
         if links is not None:
-            problem = problem.with_effects([*problem.effects, links.effect(robot)])
+            problem = problem.with_effects([*problem.effects, arm_effect(links, robot)])
             start = State(start.edges, problem.start_values)
         cold = fit = fit_problem(problem, start)
         drift = ThermalFit.expected(model.robot, nominal, inputs)

@@ -12,9 +12,11 @@ from visioncal.calibration.suspects.mounting import other_mounting
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, REMARK, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg
+from visioncal.core.transforms import LEVER_M
 from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
-from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, stops_of
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.steps import DRIFT
+from visioncal.robot.errors import SIGNIFICANT
 
 _LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.

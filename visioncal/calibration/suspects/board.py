@@ -16,7 +16,6 @@ from visioncal.core.quantiles import FALSE_ALARM, SIGMA_PER_MAD, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import LEFT_OPEN, NOTE, Finding, Remedy
-from visioncal.estimation.appearance import ASPECT, BOARD_NAMES, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
     MeasuredScale,
@@ -26,6 +25,7 @@ from visioncal.estimation.joint import (
     size_of_measured,
 )
 from visioncal.estimation.unknowns import BOARD, LENS
+from visioncal.vision.board_shape import ASPECT, BOARD_NAMES, SCALE, SHEAR, shaped_corners
 from visioncal.vision.boards import kind_of
 from visioncal.vision.targets import corner_positions
 

@@ -18,11 +18,9 @@ from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, STEPS
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import LEVER_M, exp
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import LEFT_OPEN, Finding
-from visioncal.estimation.appearance import SCALE
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -32,6 +30,7 @@ from visioncal.estimation.unknowns import BOARD, LENS, SIZE
 from visioncal.model.effects import Creeps, JointsCreep
 from visioncal.model.effects.posture import Stretches
 from visioncal.robot.model import REPEATABILITY
+from visioncal.vision.board_shape import SCALE
 from visioncal.vision.camera import intrinsics
 
 _LIMITS = CalibrationLimits()

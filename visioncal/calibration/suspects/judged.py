@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from visioncal.calibration.stages.need import Picks
+from visioncal.core.directions import Direction
 from visioncal.core.types import Need, Rejection
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
 from visioncal.results.views import holdout_rms, left_out_rms
 from visioncal.robot.model import REPEATABILITY

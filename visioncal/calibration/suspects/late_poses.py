@@ -10,10 +10,9 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import view_words
-from visioncal.core.transforms import distances
+from visioncal.core.transforms import distances, robot_part
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Remedy, mending
-from visioncal.estimation.chain import robot_part
 
 _KIND = "late_poses"
 # Poses are those of the joint angles, and of the flange [m, rad].

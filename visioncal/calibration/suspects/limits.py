@@ -12,6 +12,7 @@ from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, row_words, sigma_words
+from visioncal.core.transforms import LEVER_M
 from visioncal.core.verdict import (
     CALIBRATE,
     LEAST_NEED_MM,
@@ -21,7 +22,6 @@ from visioncal.core.verdict import (
     look_at,
     without,
 )
-from visioncal.estimation.arm import LEVER_M
 from visioncal.results import Rms, ViewResult
 
 _LIMITS = CalibrationLimits()

@@ -9,9 +9,9 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
+from visioncal.core.transforms import robot_part
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending
-from visioncal.estimation.chain import robot_part
 from visioncal.estimation.observability import too_little_motion
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 

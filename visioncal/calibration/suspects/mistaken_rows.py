@@ -13,10 +13,9 @@ from visioncal.calibration.suspects.record import LEAST, Edges, Record, evidence
 from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted, ranges, some_of, view_words
-from visioncal.core.transforms import apply, compose, exp, invert, rotation_angle
+from visioncal.core.transforms import apply, compose, exp, invert, robot_part, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import Finding, mending, or_alone
-from visioncal.estimation.chain import robot_part
 
 # Rows that images and poses are apart, from none on: some lost or doubled pictures.
 SHIFTS = (0, *(sign * by for by in range(1, 7) for sign in (1, -1)))

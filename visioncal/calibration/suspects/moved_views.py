@@ -9,13 +9,13 @@ import numpy as np
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, ranges, view_words
-from visioncal.core.transforms import exp, invert, log, pose_difference, rotation_angle
+from visioncal.core.transforms import LEVER_M, exp, invert, log, pose_difference, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import Finding, Remedy, mending, or_alone
-from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.estimation.moves import find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.steps import step_of
+from visioncal.robot.errors import TWIST_UNITS
 from visioncal.vision.targets import half_turn_of
 
 # Views among many outliers of one end that agree by chance, one of so many; what a step that few

@@ -13,10 +13,9 @@ from visioncal.calibration.pipeline.guess_inputs import alike_turning
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import counted, listed
-from visioncal.core.transforms import compose
+from visioncal.core.transforms import compose, robot_part
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.chain import robot_part
 
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 # Position by axis, and rotation; all four together are rows that are apart.

@@ -16,9 +16,8 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import stop_of
 from visioncal.calibration.stages.readings import places_of_one_point
 from visioncal.core.limits import FEWEST_COMPARED
-from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.transforms import invert, robot_part, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount
-from visioncal.estimation.chain import robot_part
 from visioncal.vision.targets import corner_positions, rotation_transforms
 
 # Least standard deviation by axis, without unit: digits of a table.

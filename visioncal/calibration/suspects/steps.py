@@ -18,8 +18,8 @@ from visioncal.core.number_format import figure, mm_and_deg, ranges
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import LEFT_OPEN, Finding, Remedy
-from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
+from visioncal.robot.model import joint_words
 
 _LIMITS = CalibrationLimits()
 # Prints of one file agree to less, and a print changes its size by as much with the air.

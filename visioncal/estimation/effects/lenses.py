@@ -12,11 +12,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
-from visioncal.estimation.appearance import Appearance, Compressed, compress, shape_slices
+from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.unknowns import BOARD, LENS
+from visioncal.vision.board_shape import shape_slices
 from visioncal.vision.camera import intrinsics, with_intrinsics
 from visioncal.vision.corners import floored_sigma_px
 

@@ -209,7 +209,7 @@ def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     """Calibrates on one thread, and writes the outputs of `visioncal calibrate`."""
     # Imported late, since a finished batch needs none of it.
     from visioncal.calibration.run import run
-    from visioncal.calibration.stages.detect import ONE_OPENCV_THREAD
+    from visioncal.vision.detection import ONE_OPENCV_THREAD
 
     with ONE_OPENCV_THREAD.held():
         pictures = RECORDING not in job.options.without

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration.stages.motion import is_standing_still
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import known_name, some_of
@@ -33,6 +32,7 @@ from visioncal.interchange.formats.foreign import (
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
 from visioncal.robot.trajectory import Trajectory
+from visioncal.session.motion import is_standing_still
 
 _ENDINGS = (".bag", ".mcap", ".db3")
 # Frames of a robot that are preferred where TF has several, by what they are.

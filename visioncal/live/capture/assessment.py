@@ -7,7 +7,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.calibration.stages.pnp import measure_poses
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import distances, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
@@ -16,6 +15,7 @@ from visioncal.planning.design import Accuracy
 from visioncal.planning.information import predict_worlds
 from visioncal.planning.plan_file import PlanFile
 from visioncal.robot import Robot
+from visioncal.vision.pnp import measure_poses
 
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
 _SAME_M, _SAME_RAD = 1e-2, 2e-2

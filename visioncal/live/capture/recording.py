@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
@@ -25,6 +24,7 @@ from visioncal.planning.plan_file import PlanFile
 from visioncal.robot import Robot
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image
+from visioncal.vision.detection import find_corners
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DriverError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
@@ -16,6 +15,7 @@ from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.vision.boards import blur_of
 from visioncal.vision.boards.imaging import grey_of
+from visioncal.vision.detection import find_corners
 
 # Tolerance of a frame's stamp before it was requested, or after it arrived [s].
 _EARLY_S = 0.02

@@ -12,7 +12,6 @@ from typing import Concatenate, ParamSpec
 
 import numpy as np
 
-from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose
 from visioncal.core.errors import DataError, DriverError, VisioncalError
@@ -47,6 +46,7 @@ from visioncal.live.page.suggestion import NextPose, suggested_pose
 from visioncal.planning.cell import flange_at
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image, grey_of
+from visioncal.vision.detection import find_corners
 
 _P = ParamSpec("_P")
 # Why a request is refused.

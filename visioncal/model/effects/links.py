@@ -6,10 +6,10 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect
 from visioncal.robot import Robot
+from visioncal.robot.errors import TWIST_UNITS
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from visioncal.core.number_format import figure, mm_and_deg
-from visioncal.core.transforms import adjoint, invert
+from visioncal.core.transforms import LEVER_M, adjoint, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import SIGNIFICANT, Effect, Named, Size, Stood
 

@@ -8,9 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import invert, log
+from visioncal.core.transforms import LEVER_M, invert, log
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect, Named, Stood
 

@@ -10,9 +10,9 @@ from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.arm import TWIST_UNITS, ArmErrors
 from visioncal.robot import Loads, Robot
 from visioncal.robot.elasticity import WeightFunctions, deflected_joints
+from visioncal.robot.errors import TWIST_UNITS, ArmErrors
 
 # Columns of a joint's function (see `Robot.function_jacobian`) by block.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}

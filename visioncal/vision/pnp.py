@@ -8,11 +8,8 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.linalg import covariance_from
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import adjoint, invert
+from visioncal.core.transforms import adjoint, distances_m, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
-from visioncal.fit.consensus import distances_m
-from visioncal.session import Session
-from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.vision.corners import CornerStack, floored_sigma_px, mean_square_by_view
 from visioncal.vision.gating import gate
 from visioncal.vision.poses import PoseFit, fit_poses, planar_poses
@@ -198,25 +195,6 @@ def _with_rivals(
             )
         )
     return tuple(views)
-
-
-def stated_poses(session: Session) -> dict[int, ViewPoses]:
-    """Collects the poses that the session states itself (`cft_` columns), by view."""
-    boards = {name: at for at, name in enumerate(session.boards)}
-    given = ((view, view.matrix(MEASURED_CAM_POSE)) for view in session.views)
-    return {
-        view.number: ViewPoses(
-            view.number,
-            None,
-            pose[None],
-            (0,),
-            np.zeros((1, 6, 6)),
-            np.zeros((1, 6, 0)),
-            boards.get(session.board_of(view), 0),
-        )
-        for view, pose in given
-        if pose is not None
-    }
 
 
 def _inlier_corners(stack: CornerStack, at: int) -> Corners:
