@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from datetime import date, time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tomli_w
 
@@ -14,6 +14,7 @@ from visioncal.core.files import named_errors, sha256, write_atomically
 from visioncal.core.temporary import temporary
 from visioncal.robot.files import robot_file
 from visioncal.robot.model import LINK_KEYS
+from visioncal.session.content import SessionContent
 from visioncal.session.corners import FILE as CORNERS
 from visioncal.session.corners import write_corners
 from visioncal.session.document import Kind
@@ -23,9 +24,6 @@ from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import write_stream
 from visioncal.session.table import write_csv
 from visioncal.vision.targets import stored_target
-
-if TYPE_CHECKING:
-    from visioncal.session.session import Session
 
 
 def refuse_filled(folder: Path, more: str = "") -> None:
@@ -38,7 +36,7 @@ def refuse_filled(folder: Path, more: str = "") -> None:
         )
 
 
-def save_session(session: "Session", folder: Path) -> None:
+def save_session(session: SessionContent, folder: Path) -> None:
     """Writes a session atomically; see `Session.save`."""
     folder = folder.absolute()
     document, texts = _placed_files(session)
@@ -72,7 +70,7 @@ def _write_below(folder: Path, path: str, data: bytes | str) -> None:
     write_atomically(folder / path, data)
 
 
-def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str | bytes]]:
+def _placed_files(session: SessionContent) -> tuple[dict[str, Any], dict[str, str | bytes]]:
     """Moves target and robot files into the session's folder."""
     declaration, placed, texts = (
         session.declaration,
@@ -116,7 +114,7 @@ def _place_inside(path: str, fallback: str) -> str:
         return fallback
 
 
-def digest_of(session: "Session") -> str:
+def digest_of(session: SessionContent) -> str:
     """Computes the SHA-256 digest of a session's canonical content; see `Session.digest`.
 
     The robot's link dimensions, masses and drives, the form of poses of its results,

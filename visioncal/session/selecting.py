@@ -2,13 +2,14 @@
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 from visioncal.core.choice import Choice
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, ranges, some_of
 from visioncal.core.types import Mount
 from visioncal.session.columns import SELECTORS, is_number
+from visioncal.session.content import SessionContent
 from visioncal.session.document import KINDS
 from visioncal.session.frames import frame_name, frames_of_kind, object_name, robots_between
 from visioncal.session.kinds import COLUMN as TARGET
@@ -16,6 +17,7 @@ from visioncal.session.kinds import has_robot_state, is_camera_observation, name
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
+S = TypeVar("S", bound=SessionContent)
 Part: TypeAlias = Literal["camera", "robot", "target"]
 PARTS: tuple[Part, ...] = get_args(Part)
 # Parts that must be unambiguous for a camera with any target, and without a camera.
@@ -147,20 +149,17 @@ def _combinations(
                     yield Chosen(mount if camera else "instrument", camera, robot, target)
 
 
-if TYPE_CHECKING:
-    from visioncal.session.session import Session
-
 # Beginnings of number columns that are not the robot's.
 _NOT_OF_ROBOTS = ("stamp_s", "ambient_c", "cft_", "meas_")
 
 
-def has_several(session: "Session") -> bool:
+def has_several(session: SessionContent) -> bool:
     """Whether it has several cameras, robots, targets or instruments."""
     return any(len(session.declaration.named(kind)) > 1 for kind in KINDS)
 
 
 def chosen_of(
-    session: "Session",
+    session: SessionContent,
     choice: Choice,
     needs: Collection[Part] = PARTS,
     *,
@@ -175,12 +174,12 @@ def chosen_of(
 
 
 def select(
-    session: "Session",
+    session: S,
     choice: Choice,
     needs: Collection[Part] = PARTS,
     *,
     robot_between: bool = True,
-) -> "Session":
+) -> S:
     """Selects one camera, robot and target from a session; see `Session.of` and `choose`.
 
     Where no camera is needed, the rows are those without images with the robot's pose.
@@ -229,7 +228,7 @@ def select(
     return selected.with_streams(streams_of(session, chosen.robot))
 
 
-def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
+def keep_views(session: S, numbers: Collection[int]) -> S:
     """Selects views of a session, with the robots' rows at their stops; see `Session.only`.
 
     Raises:
@@ -258,7 +257,7 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
     )
 
 
-def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
+def streams_of(session: SessionContent, robot: str) -> dict[str, Stream]:
     """The streams of one robot, and those of no robot, by name.
 
     A stream has the name of its robot, or begins with it, as `a` and `a_excite`.
@@ -276,7 +275,7 @@ def _is_of_robots(column: str) -> bool:
     return is_number(column) and not column.startswith(_NOT_OF_ROBOTS)
 
 
-def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
+def _document(session: SessionContent, chosen: Chosen) -> dict[str, Any]:
     """Content of session.toml for the chosen parts."""
     document = dict(session.document)
     for name in ("frames", "clocks", "prior", "mount", *KINDS, *(f"{kind}s" for kind in KINDS)):
@@ -309,7 +308,7 @@ def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
     return document | ({"prior": priors} if priors else {})
 
 
-def is_whole_cell(session: "Session") -> bool:
+def is_whole_cell(session: SessionContent) -> bool:
     """Whether a session can only be calibrated as a whole cell.
 
     This includes a camera with an instrument, where the session has `[frames]`.
@@ -318,12 +317,12 @@ def is_whole_cell(session: "Session") -> bool:
     return bool(_whole_cell_words(session)) or (both and bool(session.declaration.frames))
 
 
-def must_select_one(session: "Session", choice: Choice) -> bool:
+def must_select_one(session: SessionContent, choice: Choice) -> bool:
     """Whether one of each must be selected; several boards of one camera and robot need not be."""
     return is_whole_cell(session) or (not choice.is_any and has_several(session))
 
 
-def check_one_of_each(session: "Session") -> None:
+def check_one_of_each(session: SessionContent) -> None:
     """Checks that a session has one camera, robot and instrument, and boards on one side.
 
     Raises:
@@ -339,7 +338,7 @@ def check_one_of_each(session: "Session") -> None:
         )
 
 
-def _whole_cell_words(session: "Session") -> str:
+def _whole_cell_words(session: SessionContent) -> str:
     """Why a session is of a whole cell, in words; empty where it is not."""
     several = {kind: list(session.declaration.named(kind)) for kind in KINDS if kind != "target"}
     words = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
