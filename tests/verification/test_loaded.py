@@ -9,7 +9,6 @@ from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError
-from visioncal.results.conditions import conditions_of
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation.arms import Payload, arm_named
 from visioncal.simulation.instrument_session import (
@@ -62,7 +61,7 @@ def test_three_forces_at_one_pose_show_shoulder_and_elbow(unloaded):
     assert "10 to 50 N move the tip by" in words
     assert "joint_6 (no moment reaches it)" in words
     # Forces are stated, and no payload is.
-    conditions = " ".join(condition.sentence for condition in conditions_of(result))
+    conditions = " ".join(condition.sentence for condition in result.conditions)
     assert "under the 10 to 50 N of the stops" in conditions
     assert "kg of the stops" not in conditions
 

@@ -12,7 +12,7 @@ calibration's own stops showed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -22,15 +22,16 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
-from visioncal.results import Calibration, CameraResult, Edge
 from visioncal.results.arm import FUNCTIONS
+from visioncal.results.content import CalibrationContent
+from visioncal.results.edge import Edge
+from visioncal.results.lens import CameraResult
+from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.errors import pose_basis
 from visioncal.session.frames import edge_names
 from visioncal.vision.camera import intrinsics
 
 # Locating a pixel takes a millisecond; the arm's model is slow to import.
-if TYPE_CHECKING:
-    from visioncal.robot.arm_model import ArmModel
 
 # A transform, or its (4, 4) matrix.
 Pose: TypeAlias = FloatArray | RigidTransform
@@ -40,13 +41,13 @@ Pose: TypeAlias = FloatArray | RigidTransform
 class ArmErrors:
     """Posterior of the errors of an arm that was calibrated with the camera."""
 
-    model: "ArmModel"  # The arm's model with its p error parameters.
+    model: ArmModel  # The arm's model with its p error parameters.
     covariance: FloatArray  # (p, p) of the parameters.
     # (6 + k + m, p) cross-covariance with the camera's edge and lens, as in `CalibratedCamera`.
     with_camera: FloatArray
 
     @classmethod
-    def of(cls, calibration: Calibration, camera: FloatArray) -> Self | None:
+    def of(cls, calibration: CalibrationContent, camera: FloatArray) -> Self | None:
         """Reads the posterior from a calibration; None where its arm was not calibrated.
 
         `camera` is the (6 + k + m, 6 + k + m) covariance of the camera's edge and lens.
@@ -57,9 +58,7 @@ class ArmErrors:
             return None
         if fit is None or not calibration.arm_is_calibrated:
             return None
-        from visioncal.verification.calibration_prior import fitted_model
-
-        model = fitted_model(calibration.calibrated_robot, fit.arm)
+        model = None if fit.arm is None else fit.arm.model(calibration.calibrated_robot)
         if fit.arm is None or model is None or calibration.camera is None:
             return None
         lens_size = len(intrinsics(calibration.camera.camera))
@@ -96,7 +95,7 @@ class CalibratedCamera:
     distances_m: FloatArray | None
 
     @classmethod
-    def of(cls, calibration: Calibration) -> Self:
+    def of(cls, calibration: CalibrationContent) -> Self:
         """Reads the camera from a calibration; raises DataError."""
         result = calibration.camera
         if result is None:

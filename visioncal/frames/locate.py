@@ -21,8 +21,9 @@ from visioncal.frames.camera_chain import (
     point_jacobian,
 )
 from visioncal.frames.located import Located
-from visioncal.results import Calibration
+from visioncal.results.content import CalibrationContent
 from visioncal.results.depth import DepthResult
+from visioncal.results.selecting import selected
 from visioncal.session.selecting import EYE, Choice
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.targets import load_target
@@ -34,7 +35,7 @@ _BEYOND = 1.5
 
 @typed
 def locate(
-    calibration: Calibration,
+    calibration: CalibrationContent,
     px: FloatArray,
     plane: Plane,
     base_from_flange: Pose | None = None,
@@ -64,7 +65,7 @@ def locate(
         DataError: There is no camera or no pose of the robot, a pixel is outside the image, or its
             ray does not meet the plane in front of the camera.
     """
-    eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
+    eye = CalibratedCamera.of(selected(calibration, Choice(camera, robot), EYE))
     noise_px, cam_pose = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
     px, rays = _rays(eye, px)
     return tuple(
@@ -74,7 +75,7 @@ def locate(
 
 @typed
 def locate_by_depth(
-    calibration: Calibration,
+    calibration: CalibrationContent,
     px: FloatArray,
     depth_m: FloatArray | float,
     base_from_flange: Pose | None = None,
@@ -100,7 +101,7 @@ def locate_by_depth(
     Raises:
         DataError: As `locate`, or a distance is not above 0.
     """
-    eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
+    eye = CalibratedCamera.of(selected(calibration, Choice(camera, robot), EYE))
     noise_px, cam_pose = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
     px, rays = _rays(eye, px)
     measured = np.broadcast_to(np.asarray(depth_m, dtype=float), len(px))
@@ -144,7 +145,9 @@ def locate_by_depth(
     return tuple(found)
 
 
-def seen_distances(calibration: Calibration, depth_m: FloatArray, px: FloatArray) -> FloatArray:
+def seen_distances(
+    calibration: CalibrationContent, depth_m: FloatArray, px: FloatArray
+) -> FloatArray:
     """Distances at pixels of the image by the picture of a depth camera, NaN where there are none.
 
     The depth of a camera beside is interpolated between the nearest of its points that are seen
@@ -183,7 +186,7 @@ def seen_distances(calibration: Calibration, depth_m: FloatArray, px: FloatArray
 
 
 def cloud_in_base(
-    calibration: Calibration,
+    calibration: CalibrationContent,
     points_cam: FloatArray,
     base_from_flange: Pose | None = None,
     *,
@@ -387,7 +390,7 @@ _SOURCES = {
 
 @typed
 def locate_target(
-    calibration: Calibration,
+    calibration: CalibrationContent,
     seen: Corners | Image,
     target: Target | Path | str,
     base_from_flange: Pose | None = None,
@@ -424,7 +427,7 @@ def locate_target(
     # A pixel waits for no search of images.
     from visioncal.frames.target_in_image import target_pose_candidates
 
-    eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
+    eye = CalibratedCamera.of(selected(calibration, Choice(camera, robot), EYE))
     cam_pose = eye.at(base_from_flange, joints_rad)
     board = target if isinstance(target, Target) else load_target(target)
     view = target_pose_candidates(eye, seen, board, label, sigma_px)

@@ -3,15 +3,13 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.verdict import Verdict
 from visioncal.results.arm import ArmSections
+from visioncal.results.cell import CellResult
 from visioncal.results.lens import CameraResult, sensor_tilt
-
-if TYPE_CHECKING:
-    from visioncal.results.result import Calibration
 
 # Tilt up to which a sensor counts as parallel to its lens [deg]: makers of industrial cameras state
 # 0.2 to 0.6 about each axis (Basler, pilot user's manual, 1.5.2.2), which is 0.8 about both.
@@ -46,13 +44,12 @@ def uncorrected_words(verdict: Verdict) -> str:
     )
 
 
-def conditions_of(calibration: "Calibration") -> Iterator[Condition]:
-    """The conditions of a calibration, those of a whole cell with the name of their part."""
-    cell = calibration.by_name
+def conditions_of(cell: CellResult, verdict: Verdict) -> Iterator[Condition]:
+    """The conditions of a result, those of a whole cell with the name of their part."""
     for name, arm in cell.robots.items():
-        yield from _of_arm(arm, calibration.verdict, name)
+        yield from _of_arm(arm, verdict, name)
     # A bad result holds nowhere.
-    for name, lens in cell.cameras.items() if calibration.verdict.status != "bad" else ():
+    for name, lens in cell.cameras.items() if verdict.status != "bad" else ():
         yield from _of_lens(lens, name)
 
 

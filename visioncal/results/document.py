@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from visioncal.core.codec import (
     INLINE,
@@ -21,6 +21,7 @@ from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.results.cell import CellResult
 from visioncal.results.conditions import Condition
+from visioncal.results.content import CalibrationContent
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, RayFrame
@@ -35,10 +36,6 @@ from visioncal.results.parts import (
 from visioncal.results.sections import BoardResult, CalibrationSections, RigResult
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
 from visioncal.session.frames import edge_names
-
-if TYPE_CHECKING:
-    from visioncal.results.result import Calibration
-
 
 # The estimated transforms by name.
 Edges = Annotated[Mapping[str, StoredEdge], Key("transforms")]
@@ -113,7 +110,7 @@ _OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame conditio
 _OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation conditions")
 
 
-def to_document(calibration: "Calibration") -> dict[str, Any]:
+def to_document(calibration: CalibrationContent) -> dict[str, Any]:
     """Content of calibration.json; what was not computed is absent."""
     # Conditions and `ray_frame` derive from other sections, and are written for other readers.
     head: dict[str, Any] = {

@@ -7,10 +7,14 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from visioncal.core.codec import REST, Array, Matrix, Section, Vector
+from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.estimation.effects.rolling_shutter import Shutter
 from visioncal.results.arm import ArmSections
 from visioncal.results.edge import Covariance
+from visioncal.robot import Robot
+from visioncal.robot.arm_model import ArmModel
+from visioncal.robot.elasticity import WeightFunctions
 from visioncal.vision.board_shape import BOARD_NAMES, shaped_corners
 
 _BEND = "bow_"
@@ -189,6 +193,30 @@ class FittedArm:
     # (4 n, r) for each joint, a basis of the effect of its links' weight (see
     # `robot.WeightFunctions`).
     weight_functions: tuple[Matrix, ...] | None = None
+
+    def model(self, arm: Robot | None) -> ArmModel | None:
+        """An arm's model linearised at its estimate; None for errors of another kind."""
+        # The geometry is part of the arm; errors that depend on a stop's loads are in the values.
+        if self.of != "model" or arm is None:
+            return None
+        flange_from_reported, weights = self.flange_from_reported, self.weights
+        if flange_from_reported is None or weights is None:
+            raise ValueError("arm.flange_from_reported or arm.weights is missing")
+        mounted = np.zeros((arm.joint_count + 1, 6))
+        mounted[-1] = log(invert(flange_from_reported))
+        functions, shape = None, (4 * arm.joint_count, -1)
+        if self.weight_functions is not None:
+            parts = tuple(part.reshape(shape) for part in self.weight_functions)
+            functions = WeightFunctions(parts)
+        return ArmModel(
+            arm.corrected(mounted),
+            flange_from_reported,
+            weights,
+            np.zeros(len(self.values)) if self.by_stop is None else self.by_stop,
+            1.0 if self.torque_nm is None else self.torque_nm,
+            self.yielding,
+            functions,
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

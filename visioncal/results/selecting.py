@@ -2,15 +2,17 @@
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.codec import entries
+from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.results.arm import ArmSections
 from visioncal.results.cell import CellResult
+from visioncal.results.content import CalibrationContent
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.parts import RobotResult
@@ -20,12 +22,25 @@ from visioncal.results.views import Rms, Validation, rms_of
 from visioncal.session.frames import frames_of_kind, object_name, robots_between
 from visioncal.session.selecting import PARTS, Choice, Chosen, Part, choose
 
-if TYPE_CHECKING:
-    from visioncal.results.result import Calibration
+C = TypeVar("C", bound=CalibrationContent)
 
 
-def selected_fields(
-    whole: "Calibration", cell: CellResult, choice: Choice, needs: Collection[Part]
+def selected(whole: C, choice: Choice, needs: Collection[Part] = PARTS) -> C:
+    """Selects one camera, robot and target; see `Calibration.chosen`."""
+    if whole.cell is not None:
+        return replace(whole, **_selected_fields(whole, whole.cell, choice, needs))
+    if not choice.is_any:
+        raise DataError(
+            f"calibration {whole.session_name!r} is of one camera and one robot, which have no "
+            "names.",
+            culprits=[f"--{part}" for part in PARTS if getattr(choice, part)],
+            next_step="Leave their names out.",
+        )
+    return whole
+
+
+def _selected_fields(
+    whole: CalibrationContent, cell: CellResult, choice: Choice, needs: Collection[Part]
 ) -> dict[str, Any]:
     """Fields of the calibration of one camera, robot and target that differ from the cell's.
 
@@ -91,7 +106,7 @@ def selected_fields(
 
 
 def transform_name_in_cell(
-    whole: "Calibration", choice: Choice, needs: Collection[Part], name: str
+    whole: CalibrationContent, choice: Choice, needs: Collection[Part], name: str
 ) -> str:
     """Name in the whole cell of a transform of the selected calibration."""
     if whole.cell is None:
@@ -103,7 +118,7 @@ def transform_name_in_cell(
 
 
 def targets_fixed_to_base(
-    whole: "Calibration", choice: Choice, needs: Collection[Part]
+    whole: CalibrationContent, choice: Choice, needs: Collection[Part]
 ) -> dict[str, Edge]:
     """Poses of the cell's targets that are fixed to a robot's base: `base_from_target_floor`."""
     if whole.cell is None:
@@ -116,7 +131,7 @@ def targets_fixed_to_base(
     }
 
 
-def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Chosen:
+def _chosen(whole: CalibrationContent, choice: Choice, needs: Collection[Part]) -> Chosen:
     """The chosen parts in the last poses; parts neither needed nor named are empty."""
     chosen = choose(whole.tree.last, choice, needs, label=f"the cell {whole.session_name!r}")
     kept = {*needs, *(part for part in PARTS if getattr(choice, part))}

@@ -6,17 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.estimation.appearance import Appearance, LensBoardParameters
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.results import Calibration
 from visioncal.results.arm import FUNCTIONS
-from visioncal.results.sections import FittedArm, JointFit
-from visioncal.robot import Robot
+from visioncal.results.sections import JointFit
 from visioncal.robot.arm_model import ArmModel
-from visioncal.robot.elasticity import WeightFunctions
 from visioncal.robot.errors import posture_correlation
 from visioncal.session.frames import edge_names
 from visioncal.verification.model_evidence import CalibrationPosterior, RepeatedStops
@@ -185,27 +183,5 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
             np.concatenate([np.zeros(len(fit.looks)), values]),
         ),
         fit.covariance,
-        fitted_model(calibration.calibrated_robot, fit.arm),
-    )
-
-
-def fitted_model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
-    """The arm's model linearised at its estimate; None for errors of another kind."""
-    # The geometry is part of the arm; errors that depend on the loads of a stop are in the values.
-    if fitted is None or fitted.of != "model" or arm is None:
-        return None
-    flange_from_reported, weights = fitted.flange_from_reported, fitted.weights
-    if flange_from_reported is None or weights is None:
-        raise ValueError("arm.flange_from_reported or arm.weights is missing")
-    mounted = np.zeros((arm.joint_count + 1, 6))
-    mounted[-1] = log(invert(flange_from_reported))
-    parts, shape = fitted.weight_functions, (4 * arm.joint_count, -1)
-    return ArmModel(
-        arm.corrected(mounted),
-        flange_from_reported,
-        weights,
-        np.zeros(len(fitted.values)) if fitted.by_stop is None else fitted.by_stop,
-        1.0 if fitted.torque_nm is None else fitted.torque_nm,
-        fitted.yielding,
-        None if parts is None else WeightFunctions(tuple(part.reshape(shape) for part in parts)),
+        None if fit.arm is None else fit.arm.model(calibration.calibrated_robot),
     )
