@@ -16,11 +16,12 @@ from visioncal.dynamics.differences import (
     scale_difference,
     stream_differences,
 )
-from visioncal.dynamics.identified import Lag, judge
+from visioncal.dynamics.identified import judge
 from visioncal.dynamics.identify import Options, identify
 from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.payload import estimate_payload
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
+from visioncal.dynamics.statistics import Lag
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.session import Session

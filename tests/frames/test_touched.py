@@ -22,7 +22,8 @@ from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, skew
 from visioncal.estimation.problem_parts import Noise
-from visioncal.frames.fixture import FitSettings, drawn_fixture, touched_fixture
+from visioncal.frames.fixture import drawn_fixture, touched_fixture
+from visioncal.frames.points_frame import FitSettings
 from visioncal.frames.touches import NominalPoints, Tool, TouchRows, touched_points
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_calibration

@@ -164,7 +164,8 @@ def recording(tmp_path, monkeypatch):
 
     for name, stand_in in (("find_corners", found), ("ask_command", ask)):
         monkeypatch.setattr(stations, name, stand_in)
-    monkeypatch.setattr("visioncal.live.capture.recording.find_corners", found)
+    for user in ("recording", "take"):
+        monkeypatch.setattr(f"visioncal.live.capture.{user}.find_corners", found)
 
     @contextmanager
     def begun():

@@ -4,12 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
 from visioncal.core.choices import DYNAMICS_FILE
-from visioncal.core.codec import KEPT, Key, Vector, read, reading, write
+from visioncal.core.codec import read, reading, write
 from visioncal.core.documents.jsons import check_schema, parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
@@ -21,6 +21,7 @@ from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel, Consistent, random_motion
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.dynamics.regression import Stribeck
+from visioncal.dynamics.statistics import Lag, StreamStatistics, TorqueValidation
 from visioncal.robot import Robot
 from visioncal.robot.files import robot_names
 from visioncal.robot.inertia import Inertias
@@ -32,58 +33,6 @@ _LIMITS = DynamicsLimits()
 _Judged: TypeAlias = tuple[VerdictStatus, Finding]
 _MOTION = "Record, and fit with this one, a motion"
 SCHEMA = 1
-
-
-@dataclass(frozen=True, eq=False)
-class StreamStatistics:
-    """Statistics of a fitted stream."""
-
-    label: Annotated[str, Key("stream")]  # Its file.
-    samples: int  # Number of filtered samples.
-    left_out: int  # Number of their torques that were not used: outliers and invalid ones.
-    band_hz: float  # Bandwidth of the motion [Hz].
-    cutoff_hz: float  # Where the low-pass is 6 dB down [Hz].
-    rate_hz: float  # Sampling rate before the filter [Hz].
-    noise_nm: Vector  # (n,) noise of the filtered torques [N m].
-    rms_nm: Vector  # (n,) root mean square of the residuals [N m].
-    torque_nm: Vector  # (n,) standard deviation of the torques, as their range [N m].
-    notes: Annotated[tuple[str, ...], KEPT] = ()  # Messages on faults of its samples.
-
-
-@dataclass(frozen=True, eq=False)
-class TorqueValidation:
-    """Prediction errors of torques that were not fitted."""
-
-    label: Annotated[str, Key("samples")]  # The samples, for messages.
-    rms_nm: Vector  # (n,) root mean square error [N m].
-    torque_nm: Vector  # (n,) standard deviation of the torques, as their range [N m].
-    noise_nm: Vector  # (n,) noise of the torques by the fit [N m].
-    # (n,) error with the consistent standard parameters; None without these.
-    consistent_rms_nm: Vector | None = None
-
-    @property
-    def shares(self) -> FloatArray:
-        """(n,) error over the range of the torque."""
-        return np.asarray(self.rms_nm / np.maximum(self.torque_nm, 1e-12))
-
-
-@dataclass(frozen=True)
-class Lag:
-    """Delay of the torques behind the angles."""
-
-    seconds: float  # The delay; negative where torques are ahead [s].
-    sigma_s: float  # Its standard deviation [s].
-    share: float  # Greatest change of a joint's torques by it, over their range.
-
-    @property
-    def words(self) -> str:
-        """Message on the lag and its correction."""
-        late = self.seconds > 0.0
-        return (
-            f"The torques {'lag' if late else 'are ahead of'} the angles by "
-            f"{figure(1e3 * abs(self.seconds))} ms (sigma {figure(1e3 * self.sigma_s)}): they were "
-            f"taken so much {'earlier' if late else 'later'}."
-        )
 
 
 @dataclass(frozen=True, eq=False)

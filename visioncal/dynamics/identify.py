@@ -21,7 +21,7 @@ from visioncal.dynamics.base import (
 )
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.convention_hypotheses import check_recording
-from visioncal.dynamics.identified import Identified, Lag, StreamStatistics, TorqueValidation
+from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.dynamics.regression import (
     NoiseBlock,
@@ -32,6 +32,7 @@ from visioncal.dynamics.regression import (
     rms_of,
     std_of,
 )
+from visioncal.dynamics.statistics import Lag, StreamStatistics, TorqueValidation
 from visioncal.robot import Robot
 
 # Uncertainty of filtered speeds, below which the sign of friction is smoothed [rad/s].

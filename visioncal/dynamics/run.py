@@ -12,7 +12,7 @@ from visioncal.core.number_format import known_name
 from visioncal.core.threads import on_one_blas_thread
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.differences import scale_difference, stream_differences
-from visioncal.dynamics.identified import Identified, Lag
+from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import (
     Identification,
     Options,
@@ -23,6 +23,7 @@ from visioncal.dynamics.identify import (
     validate,
 )
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
+from visioncal.dynamics.statistics import Lag
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
 from visioncal.session.selecting import ARM, Choice, check_one_of_each, select

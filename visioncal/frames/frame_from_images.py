@@ -15,9 +15,9 @@ from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Remedy, Verdict, remarks
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
-from visioncal.frames.fixture import sigma_findings
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.placing import worst_of
+from visioncal.frames.points_frame import sigma_findings
 from visioncal.frames.session_observations import (
     detect_session_target,
     no_usable_image,

@@ -15,7 +15,6 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
 from visioncal.estimation.points import FEWEST_POINTS
-from visioncal.frames.fixture import FitSettings, PointsFit
 from visioncal.frames.pivot import (
     PivotFit,
     Touches,
@@ -28,6 +27,7 @@ from visioncal.frames.pivot import (
     two_points,
 )
 from visioncal.frames.placing import assumed_words
+from visioncal.frames.points_frame import FitSettings, PointsFit
 from visioncal.frames.touches import TouchRows, flange_poses, refuse_copies, robot_noise
 from visioncal.results import Calibration, Edge, Frame
 from visioncal.robot import Robot

@@ -13,12 +13,8 @@ from visioncal.core.number_format import counted, some_of
 from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.joints import joint_names
-from visioncal.interchange.formats.poses import (
-    PoseFields,
-    columns_named,
-    possible_poses,
-    words_of,
-)
+from visioncal.interchange.formats.pose_words import PoseFields, words_of
+from visioncal.interchange.formats.poses import columns_named, possible_poses
 from visioncal.interchange.formats.sources import Source, is_whole
 
 _OF_ROBOT = re.compile("robot|arm|gripper|flange|tcp|hand", re.IGNORECASE)

@@ -20,45 +20,19 @@ from visioncal.interchange.formats.fields import (
 )
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.pose_forms import ROTATION_NAME, split_pose
-
-
-def _set(words: str) -> set[str]:
-    return {*words.split()}
-
-
-_POSITION_WORDS = _set("translation position pos ort posición tvec tvecs trans xyz t")
-_ROTATION_WORDS = _set("rotation orientation quaternion quat rotvec rot r ori winkel drehung angle")
-_POSITION_WORDS |= {"translational"}
-_ROTATION_WORDS |= _set(
-    "rotational ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz theta"
+from visioncal.interchange.formats.pose_words import (
+    BOTH_SIDES,
+    CHILD_FIRST,
+    FRAMES,
+    PLACE,
+    POSE_WORDS,
+    POSITION_WORDS,
+    ROTATION_WORDS,
+    TRACKERS,
+    PoseFields,
+    words_of,
 )
-# Of `p_RS_R_x` the last R is a frame.
-_PLACE = _set("p position")
-_POSE_WORDS = _set("pose poses transform transforms t h matrix")
-# Words of the parent frame and of the child frame, for the robot and for the camera.
-_FRAMES = {
-    "robot": (
-        _set("base world root basis sockel welt 基座"),
-        _set("gripper flange ee tcp tool hand tip flansch greifer werkzeug brida pinza")
-        | _set("herramienta bride outil 法兰 法蘭 末端"),
-    ),
-    "camera": (
-        _set("cam camera eye sensor kamera cámara camara caméra 相机 相機 vicon optitrack mocap"),
-        _set("target board marker tag object tafel brett tablero mire 标定板 標定板"),
-    ),
-}
-_SIDE_WORDS = {
-    "robot": _set("robot arm effector eef endeffector manipulator 机器人 機器人 机械臂 機械臂"),
-    "camera": _set("charuco aruco chessboard checkerboard apriltag pattern cft"),
-}
-# Systems that measure the robot's pose, or the camera's where another side is named the robot's.
-_TRACKERS = _set("vicon optitrack mocap")
-# Names of both sides of A X = X B, where no other poses stand beside them.
-_BOTH_SIDES = (("a", "b"), ("h", "e"), ("t1", "t2"))
-# Frames by their initials, as in `t2c` and `g2b`: a parent of one side, and its children.
-_INITIALS = (("b", "base", "gefht", "gripper"), ("c", "cam", "tmo", "target"))
-# With these words between two frames the child is named first; otherwise second.
-_CHILD_FIRST = {"2", "to", "in", "wrt"}
+
 # Numbers of poses' sizes that are none, and poses that were not reached but asked for.
 # How many numbers a pose has, or its position or its rotation.
 _OF_POSES = (16, 12, 9, 7, 6, 4, 3)
@@ -82,68 +56,6 @@ _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
 )
 
 
-# Words of a script without spaces: flange, end, base, camera, board, robot, position, coordinates.
-_UNSPACED = re.compile(
-    "(法[兰蘭]|末端|基座|相[机機]|[标標]定板|[机機]器人|[机機]械臂|位置|位姿|[坐座][标標])"
-)
-
-
-def words_of(name: str) -> list[str]:
-    """The words of a field's name, in small letters and without its unit."""
-    plain = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", "_", without_unit(name)[0])
-    plain = _UNSPACED.sub(r"_\1_", plain)
-    words = [part for part in re.split(r"[\W_]+|(2)", plain.lower()) if part]
-    for at in (at for at, word in enumerate(words[1:-1], 1) if word == "2"):
-        ends = (words[at - 1], words[at + 1])
-        for letter, parent, letters, child in _INITIALS:
-            if ends in ((letter, other) for other in letters):
-                words[at - 1 : at + 2] = [parent, "2", child]
-            elif ends in ((other, letter) for other in letters):
-                words[at - 1 : at + 2] = [child, "2", parent]
-    return words
-
-
-@dataclass(frozen=True)
-class PoseFields:
-    """Fields that may hold poses: one, or those of a position and of a rotation."""
-
-    names: tuple[str, ...]
-    words: tuple[str, ...]  # Words of the names beside `position` and the like.
-    is_named: bool = True  # Whether the names are those of a pose.
-
-    @property
-    def sides(self) -> list[str]:
-        """The sides, robot or camera, whose frames the words name."""
-        return [
-            frame
-            for frame in _FRAMES
-            if {*self.words} & (_FRAMES[frame][0] | _FRAMES[frame][1] | _SIDE_WORDS[frame])
-        ]
-
-    @property
-    def is_seen(self) -> bool:
-        """Whether they are vectors of the target, as OpenCV and MATLAB call them."""
-        return not self.sides and any(map(_SEEN.search, self.names))
-
-    @property
-    def is_of_target(self) -> bool:
-        """Whether the names suggest poses of the target."""
-        return self.is_named and (self.is_seen or self.sides == ["camera"])
-
-    def is_like(self, names: Sequence[str], fields: Fields) -> bool:
-        """Whether other fields have as many numbers each: of the likeliest, which agree, copies."""
-        sizes = [[fields.column(name).shape[1] for name in each] for each in (self.names, names)]
-        return sizes[0] == sizes[1]
-
-    def is_reversed(self, whose: str) -> bool:
-        """Whether the words name the frames of a side in the order of the inverse pose."""
-        parent, child = _FRAMES[whose]
-        frames = [word for word in self.words if word in parent | child]
-        if not ({*frames} & parent and {*frames} & child):
-            return False
-        return (frames[0] in child) != bool({*self.words} & _CHILD_FIRST)
-
-
 def possible_poses(
     fields: Fields, taken: Collection[str] = (), *, by_shape: bool = True
 ) -> list[PoseFields]:
@@ -156,8 +68,8 @@ def possible_poses(
     turns: list[_Piece] = []
     for piece in (*_arrays(fields, taken), *_numbers(fields, taken)):
         words, name = {*piece.words}, piece.names[0].lower()
-        is_turn = piece.size == 3 and bool(_ROTATION_WORDS & words) and words.isdisjoint(_PLACE)
-        named = _POSE_WORDS | _CHILD_FIRST | _FRAMES["robot"][1]
+        is_turn = piece.size == 3 and bool(ROTATION_WORDS & words) and words.isdisjoint(PLACE)
+        named = POSE_WORDS | CHILD_FIRST | FRAMES["robot"][1]
         is_named = bool(words & named) and not _NO_POSE.search(name)
         if is_turn or piece.appearance in ("rotation", "quaternion"):
             turns.append(piece)
@@ -169,9 +81,9 @@ def possible_poses(
             places.append(piece)
     # A position and a rotation share all other words; of several rotations the least ambiguous is
     # taken: a matrix, then a quaternion. Of other names they share what they stand in.
-    rests = {place.rest for place in places if _POSITION_WORDS & {*place.words}}
+    rests = {place.rest for place in places if POSITION_WORDS & {*place.words}}
     for place in places:
-        is_named = bool(_POSITION_WORDS & {*place.words})
+        is_named = bool(POSITION_WORDS & {*place.words})
         alike = [turn for turn in turns if is_named and turn.rest == place.rest]
         # Of another file, rows without one have none of the other.
         alike = [turn for turn in alike if turn.parent == place.parent] or [
@@ -207,7 +119,7 @@ def _of_trackers(items: list[PoseFields], taken: Collection[str]) -> list[PoseFi
     ):
         return items
     plain = [
-        replace(item, words=tuple(word for word in item.words if word not in _TRACKERS))
+        replace(item, words=tuple(word for word in item.words if word not in TRACKERS))
         for item in items
     ]
     pairs = zip(items, plain, strict=True)
@@ -217,9 +129,9 @@ def _of_trackers(items: list[PoseFields], taken: Collection[str]) -> list[PoseFi
 def _called(items: list[PoseFields], *, is_single: bool) -> list[PoseFields]:
     """The only two poses, or one beside the other, with the sides that their names say."""
     called = {"".join(item.words): item for item in items}
-    for both in _BOTH_SIDES if len(items) == 1 + is_single else ():
+    for both in BOTH_SIDES if len(items) == 1 + is_single else ():
         if called.keys() <= {*both}:
-            sides = dict(zip(both, _FRAMES, strict=True))
+            sides = dict(zip(both, FRAMES, strict=True))
             return [replace(item, words=(sides[name],)) for name, item in called.items()]
     return items
 
@@ -316,7 +228,7 @@ class _Piece:
     @property
     def rest(self) -> tuple[str, ...]:
         """The words beside those of positions and rotations."""
-        return tuple(word for word in self.words if word not in _POSITION_WORDS | _ROTATION_WORDS)
+        return tuple(word for word in self.words if word not in POSITION_WORDS | ROTATION_WORDS)
 
     @property
     def parent(self) -> str:
@@ -330,7 +242,7 @@ def points_in(fields: Fields) -> list[PoseFields]:
     return [
         PoseFields(piece.names, piece.words)
         for piece in pieces
-        if piece.size in (3, 4) and not _ROTATION_WORDS & {*piece.words}
+        if piece.size in (3, 4) and not ROTATION_WORDS & {*piece.words}
         if not _NO_POSE.search(piece.names[0].lower())
         if piece.size == 3 or (fields.column(piece.names[-1])[:, -1] == 1.0).all()
     ]
@@ -350,12 +262,12 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
             next((part for part in known if {*part} <= named.keys()), ())
             for known in (_POSITION_NAMES, _ROTATION_NAMES)
         )
-        if _POSE_WORDS & {*words} and (columns := _counted(named)):
+        if POSE_WORDS & {*words} and (columns := _counted(named)):
             flat = np.stack([fields.numbers[name] for name in columns], axis=1)
             yield _Piece(columns, tuple(words), len(columns), appearance(flat))
         if {*named} == {*"xyzw"}:
             position, rotation = (), tuple("xyzw")
-        elif position and not rotation and _ROTATION_WORDS & {*words} and words[0] not in _PLACE:
+        elif position and not rotation and ROTATION_WORDS & {*words} and words[0] not in PLACE:
             position, rotation = (), position
         # Five and more of these are joints.
         if rotation and "q5" not in named:
@@ -503,10 +415,6 @@ def ranked_poses(
         if any(fits):
             groups[fits.index(True), bool({*item.words} & _ASKED_FOR)].append(item)
     return [groups[rank] for rank in sorted(groups)]
-
-
-# Vectors that a calibration of the camera gives.
-_SEEN = re.compile("[rt]vecs?$|(rotation|translation)(al)?_?vectors$", re.IGNORECASE)
 
 
 def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:

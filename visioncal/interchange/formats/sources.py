@@ -38,15 +38,14 @@ from visioncal.interchange.formats.intrinsics import (
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.keys import HOW
 from visioncal.interchange.formats.point_files import with_point_sets
+from visioncal.interchange.formats.pose_words import PoseFields, words_of
 from visioncal.interchange.formats.poses import (
-    PoseFields,
     column_groups,
     columns_named,
     pose_names,
     possible_poses,
     ranked_poses,
     without_copies,
-    words_of,
 )
 from visioncal.interchange.formats.reading import DOCUMENTS, read_record, read_rows
 from visioncal.robot import Robot

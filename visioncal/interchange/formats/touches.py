@@ -15,7 +15,8 @@ from visioncal.interchange.formats.columns import foreign_from, view_numbers
 from visioncal.interchange.formats.fields import Fields, named_by, without_unit
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.pose_forms import check_radians, poses_from
-from visioncal.interchange.formats.poses import columns_named, pose_names, words_of
+from visioncal.interchange.formats.pose_words import words_of
+from visioncal.interchange.formats.poses import columns_named, pose_names
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import describe, rows_in
 from visioncal.interchange.formats.unread import point_pairs

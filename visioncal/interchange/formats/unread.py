@@ -21,7 +21,8 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields, appearance, unit_by_size, without_unit
 from visioncal.interchange.formats.file_search import DRAWN, FileGroup
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions
-from visioncal.interchange.formats.poses import PoseFields, points_in, possible_poses
+from visioncal.interchange.formats.pose_words import PoseFields
+from visioncal.interchange.formats.poses import points_in, possible_poses
 from visioncal.interchange.formats.sources import Source, rows_in
 
 # Fewest pairs of points, and the largest residual of a rigid motion that maps one side's to the

@@ -1,18 +1,18 @@
 """Taking a view: wait for arm and image to settle, take frames, keep the sharpest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from visioncal.core.errors import DriverError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import Corners, FloatArray, Image, Rejection, Target
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.drivers.protocols import ArmState, Frame
+from visioncal.live.drivers.protocols import ArmState, Frame, StoredPictures
 from visioncal.vision.boards import blur_of
 from visioncal.vision.boards.imaging import grey_of
 from visioncal.vision.detection import find_corners
@@ -184,3 +184,32 @@ def image_motion_px(first: Image, latest: Image) -> float:
         return float("inf")
     shifts: FloatArray = np.asarray((moved - points)[matched, 0], dtype=float)
     return float(np.median(np.linalg.norm(shifts, axis=1)))
+
+
+def pictured_views(
+    cell: LiveCell, target: Target, states: Mapping[int, ArmState], due: str
+) -> dict[int, TakenView] | str:
+    """Views of a folder's next pictures at some states, by number; or why not.
+
+    `due` is the picture that the first state is of.
+    """
+    camera, taken = cell.camera, dict[int, TakenView]()
+    assert isinstance(camera, StoredPictures)
+    names = camera.waiting()
+    if len(names) < len(states):
+        asked, there = counted(len(states), "pose"), counted(len(names), "picture")
+        return f"{asked}, and {there} without one: save the pictures first, and press again."
+    if due != names[0]:
+        return f"The picture due is {names[0]} now: look at it, and press again."
+    for (number, state), name in zip(states.items(), names, strict=False):
+        image = camera.look(name)
+        if isinstance(image, str):
+            return f"{name}: {image}. Save it again, or leave it out; nothing was taken."
+        size, needed = (" x ".join(map(str, of)) for of in (image.shape[1::-1], camera.resolution))
+        found, _ = find_corners(grey_of(image), target, number)
+        if size != needed or isinstance(found, Rejection):
+            why = found.reason if isinstance(found, Rejection) else f"{size} px, not {needed}"
+            return f"{name}: {why}. Save it again, or leave it out; nothing was taken."
+        frame = Frame(image, cell.clock.now(), name=name)
+        taken[number] = TakenView(frame, state, found, 0.0)
+    return taken

@@ -19,11 +19,10 @@ from visioncal.core.number_format import counted
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
 from visioncal.live.capture.journal import picture_name, posed, state_of
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
-from visioncal.live.capture.take import Missed, TakenView, image_motion_px
+from visioncal.live.capture.take import Missed, TakenView, image_motion_px, pictured_views
 from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import (
     ArmState,
-    Frame,
     MovingArm,
     RequestingArm,
     StoredPictures,
@@ -151,7 +150,9 @@ class Station:
             if isinstance(found.found, Missed):
                 return found.words
         else:
-            taken = self._paired(dict(zip(numbers, states, strict=False)), seen)
+            taken = pictured_views(
+                cell, self._task.recorded.target, dict(zip(numbers, states, strict=False)), seen.due
+            )
             if isinstance(taken, str):
                 return taken
             old = [picture_name(view) for view in journal.views if view.number == again]
@@ -160,31 +161,6 @@ class Station:
         visitor.lines = typed
         self._changed(visitor)
         return ""
-
-    def _paired(self, states: Mapping[int, ArmState], seen: Snapshot) -> dict[int, TakenView] | str:
-        """Views of the next pictures of the folder at some states, by number; or why not."""
-        camera, target = self._capture.cell.camera, self._task.recorded.target
-        assert isinstance(camera, StoredPictures)
-        names, taken = camera.waiting(), dict[int, TakenView]()
-        if len(names) < len(states):
-            asked, there = counted(len(states), "pose"), counted(len(names), "picture")
-            return f"{asked}, and {there} without one: save the pictures first, and press again."
-        if seen.due != names[0]:
-            return f"The picture due is {names[0]} now: look at it, and press again."
-        for (number, state), name in zip(states.items(), names, strict=False):
-            image = camera.look(name)
-            if isinstance(image, str):
-                return f"{name}: {image}. Save it again, or leave it out; nothing was taken."
-            size, needed = (
-                " x ".join(map(str, of)) for of in (image.shape[1::-1], camera.resolution)
-            )
-            found, _ = find_corners(grey_of(image), target, number)
-            if size != needed or isinstance(found, Rejection):
-                why = found.reason if isinstance(found, Rejection) else f"{size} px, not {needed}"
-                return f"{name}: {why}. Save it again, or leave it out; nothing was taken."
-            frame = Frame(image, self._capture.cell.clock.now(), name=name)
-            taken[number] = TakenView(frame, state, found, 0.0)
-        return taken
 
     @_request
     def repose(self, visitor: Visitor, number: int, pose: PendantPose, line: str) -> str:
