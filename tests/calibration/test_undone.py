@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from support.cells import pairs_session
 from support.commands import visioncal as typed
-from support.following import follow
+from support.following import follow, judged
 from support.marks import crossed, slow
 from support.refusals import raised
 from support.whole_cells import OPTIONS, recorded
@@ -80,15 +80,8 @@ def followed(cell):
 
 def results(cell):
     """The first result, and that once its advice is followed."""
-    found = list[Calibration]()
-
-    def run(*words):
-        done = typed(*words)
-        found.append(Calibration.load("out"))
-        return done
-
-    last = follow("calibrate", cell, "-o", "out", run=run).last
-    assert last.status == 0, last.said
+    ended, found = judged(cell)
+    assert ended.last.status == 0, ended.last.said
     return found[0], found[-1]
 
 

@@ -20,6 +20,7 @@ from support.commands import Done, every_command, visioncal
 from support.edited import edit_rows
 
 from visioncal.present import viewer
+from visioncal.results import Calibration
 
 Run = Callable[..., Done]
 
@@ -148,6 +149,22 @@ def follow(*words: object, steps: int = 6, run: Run = visioncal) -> Followed:
         done.append(f"{found.key}\n{found.words}")
         current, ended = _do(found, current, run, trail)
         runs.append(ended or _called(run, current))
+
+
+def judged(folder: str) -> tuple[Followed, list[Calibration]]:
+    """Calibrates a session as `follow` does: what was done, and each result on the way.
+
+    A calibration that is refused has none.
+    """
+    found = list[Calibration]()
+
+    def run(*words: object) -> Done:
+        done = visioncal(*words)
+        if words[0] == "calibrate" and done.status != 2:
+            found.append(Calibration.load(str(words[words.index("-o") + 1])))
+        return done
+
+    return follow("calibrate", folder, "-o", "out", run=run), found
 
 
 @dataclass(frozen=True)
