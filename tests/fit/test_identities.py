@@ -284,7 +284,7 @@ def assert_left_out_as_by_refits(fit, left_out):
 
 
 @pytest.mark.parametrize(("given", "in_hand"), [(True, True), slow(False, True), slow(True, False)])
-@pytest.mark.parametrize("draws", seeds(5, 60))
+@pytest.mark.parametrize("draws", seeds(2, 60))
 def test_errors_are_as_large_as_the_covariance_says(given, in_hand, draws):
     squares = []
     for seed in draws:
@@ -322,7 +322,7 @@ def test_errors_of_200_cells_scatter_as_the_covariance_says_in_every_direction(i
     assert np.abs(between - np.eye(6)).max() < 4.0 / np.sqrt(200)
 
 
-@pytest.mark.parametrize("draws", seeds(5, 40))
+@pytest.mark.parametrize("draws", seeds(2, 40))
 def test_predictions_err_as_much_as_stated(draws):
     squares = []
     for seed in draws:

@@ -108,7 +108,7 @@ def test_every_view_is_in_the_cell_or_reported_as_absent():
     assert "in one row of the target" in cell.absent[3]
 
 
-@pytest.mark.parametrize("draws", seeds(2, 6))
+@pytest.mark.parametrize("draws", seeds(1, 6))
 def test_a_lens_is_found_beside_views_of_one_row(draws):
     for seed in draws:
         small = made(seed, stops=24, given=False)

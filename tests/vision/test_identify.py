@@ -430,7 +430,7 @@ def test_a_checkerboard_whose_end_is_not_shown_may_have_more():
     assert "may have more columns or rows" in identity.notes[0]
 
 
-@pytest.mark.parametrize("stated", [(8, 5), (9, 7), (10, 7)])
+@pytest.mark.parametrize("stated", [(9, 7), (10, 7), slow((8, 5))])
 def test_other_counts_of_a_checkerboard_are_named_before_any_long_search(stated, monkeypatch):
     searched = []
     monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_, **__: searched.append(1))
@@ -460,7 +460,7 @@ def test_a_declared_checkerboard_is_found_beside_a_larger_one():
     assert sorted(found.corners) == [0, 1, 2]
 
 
-@pytest.mark.parametrize("rim", [3, 6, 9])
+@pytest.mark.parametrize("rim", [3, *map(slow, (6, 9))])
 def test_a_board_printed_close_to_its_edge_is_named_by_its_own_lines(rim):
     """OpenCV's search for any count takes the rim's edge for a line of corners."""
     side, size, rng = 60, (1920, 1080), np.random.default_rng(rim)
