@@ -361,8 +361,8 @@ def test_a_stop_out_of_reach_is_replaced_by_one_nearer_to_others():
     q = np.array([[0.0], [0.4], [1.6], [1.8], [2.0]])
     route = Route((0,), (np.zeros((0, 1)),), 0.0, {1: "link j2 and link j5"})
     left, chosen = np.arange(5), np.array([0, 4])
-    assert left_candidates(q, left, chosen, route, alone=True).tolist() == [0, 1, 2, 3]
-    assert left_candidates(q, left, chosen, route, alone=False).tolist() == [0, 1]
+    assert left_candidates(q, left, chosen, route, missed_only=True).tolist() == [0, 1, 2, 3]
+    assert left_candidates(q, left, chosen, route, missed_only=False).tolist() == [0, 1]
 
 
 def test_a_start_in_contact_is_refused_by_name():

@@ -35,7 +35,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
     if options.against is not None:
         _calibrate_loaded(options, loaded, options.against)
         return
-    asked = CalibrationOptions(
+    settings = CalibrationOptions(
         solver=options.solver,
         level=options.level,
         convention=options.convention,
@@ -48,7 +48,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
         loaded = loaded.with_weights(options.weights)
     left = frames_to_keep(options.out)
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
-        result = run(loaded, **(asked | {"progress": progress}))
+        result = run(loaded, **(settings | {"progress": progress}))
         progress("write", 0, 1)
         typed = need_options(options.need_mm, options.need_deg, corrected=options.corrected)
         if options.views is not None:

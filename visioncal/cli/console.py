@@ -99,7 +99,7 @@ def print_table(
     shown.print(table)
 
 
-def asked(question: str) -> str:
+def typed_line(question: str) -> str:
     """Asks on stderr, which keeps stdout for results, and returns the typed line.
 
     Raises:

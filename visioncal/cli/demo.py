@@ -131,15 +131,15 @@ def demo_command(options: DemoOptions) -> None:
     folder = options.out / "recovery"
     shutil.rmtree(folder, ignore_errors=True)
     answer(f"the encoder of joint {_SLIPPED + 1} slips by {_SLIP_DEG:g} deg")
-    asked = RecoverOptions(folder=folder, against=result)
+    recover_options = RecoverOptions(folder=folder, against=result)
     # Ends where the stops are to be recorded.
     with suppress(typer.Exit):
-        recover_command(asked)
+        recover_command(recover_options)
     slip_rad = np.zeros(len(arm_named("ur5e").offset))
     slip_rad[_SLIPPED] = np.deg2rad(_SLIP_DEG)
     bench = Bench(options.seed, tuple(slip_rad.tolist()))
     _drive(bench, read_plan(folder / "plan"), folder / "stops")
-    recover_command(asked)
+    recover_command(recover_options)
 
 
 def chi_square(calibration: Calibration, truth: Truth) -> tuple[float, float]:

@@ -294,15 +294,17 @@ def fixture_command(options: FixtureOptions) -> None:
             rows, seen = pairs
             return touched_fixture(rows, None, seen, calibration, model, touch_noise_m=noise_m)
         drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
-        robot, asked = options.robot, import_options(options, calibration)
+        robot, reading_options = options.robot, import_options(options, calibration)
         if options.tool is None and calibration is None:
-            named = drawing or any(read_touches(source, asked, robot, positions=True).kinds)
+            named = drawing or any(
+                read_touches(source, reading_options, robot, positions=True).kinds
+            )
             others = "" if named else ", nor which points they are: by --cad, or a column kind"
             raise DataError(
                 f"The tool that touched the points is not stated{others}.", next_step=NO_TOOL
             )
         tool = _tool(options.tool, calibration, robot)
-        rows = read_touches(source, asked, robot, positions=tool is None)
+        rows = read_touches(source, reading_options, robot, positions=tool is None)
         return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
 
     place_frame("fixture", options, by_touches, options.cad, options.tool)

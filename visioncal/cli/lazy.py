@@ -178,12 +178,12 @@ def _flattened(record: type) -> Iterator[inspect.Parameter]:
                 is_list = any(get_origin(part) is list for part in (kind, *get_args(kind)))
                 typed: Any = list[str] if is_list else str
                 kind = typed | None if field.default is None else typed
-            own = (_option_of(field),) if form == "flag" else ()
+            flag_names = (_option_of(field),) if form == "flag" else ()
             declare = typer.Argument if form == "argument" else typer.Option
             yield inspect.Parameter(
                 field.name,
                 inspect.Parameter.KEYWORD_ONLY,
-                annotation=Annotated[kind, declare(*(names or own), **stated)],
+                annotation=Annotated[kind, declare(*(names or flag_names), **stated)],
                 default=inspect.Parameter.empty if field.default is MISSING else field.default,
             )
 

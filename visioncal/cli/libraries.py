@@ -83,9 +83,9 @@ def _define_late(text: str, scope: dict[str, Any], made: dict[str, Any]) -> None
         def late(name: str) -> Callable[..., object]:
             def method(self: object, *args: object, **kwargs: object) -> object:
                 if not compiled:
-                    own: dict[str, Any] = {}
-                    exec(text, scope, own)
-                    methods = own["__create_fn__"](**local)
+                    namespace: dict[str, Any] = {}
+                    exec(text, scope, namespace)
+                    methods = namespace["__create_fn__"](**local)
                     methods = methods if "," in returned else [methods]
                     compiled.update(zip(names, methods, strict=True))
                 compiled[name].__qualname__ = method.__qualname__

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
-from visioncal.cli.console import asked
+from visioncal.cli.console import typed_line
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.parsing import refuse_given
@@ -75,7 +75,9 @@ def opened(
     """Opens both devices, the arm unless it is given, and closes them at the end of the block."""
     requested = DeviceSetup(options.resolution, options.exposure_us, options.gain, options.focus)
     chosen = given or open_arm(
-        *(str(options.arm), asked, options.pose_form), moves=is_moved, answers=sys.stdin.isatty()
+        *(str(options.arm), typed_line, options.pose_form),
+        moves=is_moved,
+        answers=sys.stdin.isatty(),
     )
     with closing(chosen) as arm:
         if is_moved and not isinstance(arm, MovingArm):

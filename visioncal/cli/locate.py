@@ -262,9 +262,9 @@ def _plane_of(
     names = (frame, f"{_LEAD}{frame}", f"{_LEAD}target_{frame}")
     name = next((name for name in names if name in planes), "")
     if not name:
-        there = some_of(planes) if planes else "none yet; visioncal fixture places them"
+        known_planes = some_of(planes) if planes else "none yet; visioncal fixture places them"
         raise DataError(
-            f"--plane is {frame[:80]!r}, but must be a frame in the base: {there}.",
+            f"--plane is {frame[:80]!r}, but must be a frame in the base: {known_planes}.",
             culprits=["--plane"],
             next_step=did_you_mean(f"{_LEAD}{frame.removeprefix(_LEAD)}", planes)
             or f"A plane is {FORMS}.",

@@ -95,5 +95,5 @@ class WorkOptions:
     @property
     def left_out(self) -> tuple[str, ...]:
         """The files that are left out."""
-        asked = {REPORT: self.no_report, RECORDING: self.no_recording}
-        return tuple(name for name, is_left_out in asked.items() if is_left_out)
+        omissions = {REPORT: self.no_report, RECORDING: self.no_recording}
+        return tuple(name for name, is_left_out in omissions.items() if is_left_out)

@@ -142,8 +142,8 @@ def verify_on_page(options: VerifyOptions) -> None:
             *(_result(out), calibration.controller()),
         )
 
-    asked = {"against": ("Cell", found), **{name: _FIELDS[name] for name in _DEVICES}}
-    text = PageText(f"Check {checks.name}", asked, "Check", partial(_history, checks))
+    form_fields = {"against": ("Cell", found), **{name: _FIELDS[name] for name in _DEVICES}}
+    text = PageText(f"Check {checks.name}", form_fields, "Check", partial(_history, checks))
     last = _remembered(checks)
     setup = last if last.against in found else replace(last, against=found[0])
     _serve(options.address, prepare, setup, text)

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from visioncal.cli.console import asked, print_json, say
+from visioncal.cli.console import print_json, say, typed_line
 from visioncal.cli.live_cell import check_order, opened, recorded_cell, taking_of
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.errors import DataError
@@ -80,7 +80,7 @@ def record_command(options: RecordOptions) -> None:
             report_departure(motion_summary(cell, driven, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
-        consent = Consent.of("record", asked, yes=options.yes or not drives)
+        consent = Consent.of("record", typed_line, yes=options.yes or not drives)
         start = Journal.resume if options.resume else Journal.begin
         count = options.views if driven is None else len(driven.stops)
         facts = CaptureFacts.of(cell, options.out.name, recorded, plan)

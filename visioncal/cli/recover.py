@@ -195,7 +195,7 @@ def _recorded(options: RecoverOptions, act: _Act, path: Path) -> Session:
             act.minutes["stops"] = round(max(taken_s, 0.0) / 60.0, 3)
         return session
     if options.stops is None and act.record is None:
-        asked = PlanOptions(
+        plan_options = PlanOptions(
             **{name: getattr(options, name) for name in ("camera", "robot", "target")},
             source=str(options.against),
             to_verify=True,
@@ -204,7 +204,7 @@ def _recorded(options: RecoverOptions, act: _Act, path: Path) -> Session:
         )
         with _step(options, act, "plan"):
             try:
-                act.record = plan_command(asked, path)
+                act.record = plan_command(plan_options, path)
             except DataError as error:
                 warn(f"no stops are planned: {error.message}")
     taken, places = 0 if session is None else len(session.views), planned / STOPS

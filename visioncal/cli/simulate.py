@@ -85,68 +85,68 @@ _TAKES: Mapping[str, frozenset[str]] = {
 _CENTRE_M = (0.0, 0.0, 0.1)
 
 
-def simulate_command(asked: SimulateOptions) -> None:
+def simulate_command(request: SimulateOptions) -> None:
     """Runs `visioncal simulate`."""
-    _check(asked)
-    folder = asked.folder
+    _check(request)
+    folder = request.folder
     # Checked first, as rendering takes long.
     refuse_filled(folder.absolute())
     compliance: tuple[float, ...] = ()
-    if asked.stiffness_knm:
-        each = tuple(1e-3 / stiff for stiff in asked.stiffness_knm)
-        compliance = each if len(each) > 1 else each * len(arm_named(asked.robot).offset)
-    loads = [Payload(kg, _CENTRE_M) for kg in asked.payload_kg or ()]
-    loads += [Payload(force_n=(0.0, 0.0, -newtons)) for newtons in asked.force_n or ()]
+    if request.stiffness_knm:
+        each = tuple(1e-3 / stiff for stiff in request.stiffness_knm)
+        compliance = each if len(each) > 1 else each * len(arm_named(request.robot).offset)
+    loads = [Payload(kg, _CENTRE_M) for kg in request.payload_kg or ()]
+    loads += [Payload(force_n=(0.0, 0.0, -newtons)) for newtons in request.force_n or ()]
     options = CellOptions(
-        robot=asked.robot,
-        mount=asked.mount,
-        views=asked.views,
-        target=BOARDS.get(asked.board) or load_target(asked.board),
-        camera=CAMERAS[asked.camera],
-        state_intrinsics=asked.with_intrinsics,
-        robot_sigma_m=1e-3 * asked.robot_sigma_mm,
-        robot_sigma_rad=1e-3 * asked.robot_sigma_mrad,
-        dh_sigma_m=1e-3 * asked.arm_sigma_mm,
-        dh_sigma_rad=1e-3 * asked.arm_sigma_mrad,
-        wrong_views=asked.wrong_views,
-        board_scale=asked.board_scale,
+        robot=request.robot,
+        mount=request.mount,
+        views=request.views,
+        target=BOARDS.get(request.board) or load_target(request.board),
+        camera=CAMERAS[request.camera],
+        state_intrinsics=request.with_intrinsics,
+        robot_sigma_m=1e-3 * request.robot_sigma_mm,
+        robot_sigma_rad=1e-3 * request.robot_sigma_mrad,
+        dh_sigma_m=1e-3 * request.arm_sigma_mm,
+        dh_sigma_rad=1e-3 * request.arm_sigma_mrad,
+        wrong_views=request.wrong_views,
+        board_scale=request.board_scale,
         compliance_rad_per_nm=compliance,
         payloads=tuple(loads),
-        second=Second() if asked.second_board else None,
-        recording=asked.recording,
-        camera_moved_m=1e-3 * asked.camera_moved_mm,
-        seed=asked.seed,
+        second=Second() if request.second_board else None,
+        recording=request.recording,
+        camera_moved_m=1e-3 * request.camera_moved_mm,
+        seed=request.seed,
     )
-    if asked.cell is not None:
-        _write(_whole_cell(asked.cell, options, asked), asked)
-    elif asked.instrument is not None:
+    if request.cell is not None:
+        _write(_whole_cell(request.cell, options, request), request)
+    elif request.instrument is not None:
         instrument = InstrumentOptions(
-            stops=asked.views if "views" in asked.given else InstrumentOptions.stops,
-            points=THREE if asked.instrument == "points" else THREE[:1],
-            poses=asked.instrument == "probe",
+            stops=request.views if "views" in request.given else InstrumentOptions.stops,
+            points=THREE if request.instrument == "points" else THREE[:1],
+            poses=request.instrument == "probe",
             seed=options.seed,
             **options.part(ArmOptions),
         )
-        joints = None if asked.at is None else _planned(asked.at, max(len(loads), 1))
+        joints = None if request.at is None else _planned(request.at, max(len(loads), 1))
         write_tracked(tracked(instrument, joints), folder)
-    elif asked.torques:
-        write_exercise(_exercise_options(asked, asked.robot, asked.seed), folder)
-    elif asked.warm_up:
-        rounds = Round(first=asked.views)
-        warm = WarmUpOptions(options, round=rounds, temperatures=not asked.currents)
-        _write(simulate_warm_up(warm), asked)
-    elif asked.sweep:
-        offset_s, readout_s = 1e-3 * asked.clock_offset_ms, 1e-3 * asked.readout_ms
+    elif request.torques:
+        write_exercise(_exercise_options(request, request.robot, request.seed), folder)
+    elif request.warm_up:
+        rounds = Round(first=request.views)
+        warm = WarmUpOptions(options, round=rounds, temperatures=not request.currents)
+        _write(simulate_warm_up(warm), request)
+    elif request.sweep:
+        offset_s, readout_s = 1e-3 * request.clock_offset_ms, 1e-3 * request.readout_ms
         clocks = SweepOptions(camera_minus_robot_s=offset_s, readout_s=readout_s)
-        _write(sweep(options, clocks), asked)
+        _write(sweep(options, clocks), request)
     else:
-        _write(simulate(options), asked)
+        _write(simulate(options), request)
     say(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _check(asked: SimulateOptions) -> None:
+def _check(request: SimulateOptions) -> None:
     """Refuses options that exclude each other, or that change nothing."""
-    kinds = [take for take in _TAKES if take and getattr(asked, take)]
+    kinds = [take for take in _TAKES if take and getattr(request, take)]
     if "cell" in kinds:
         kinds = [kind for kind in kinds if kind not in _TAKES["cell"]]
     if len(kinds) > 1:
@@ -159,17 +159,18 @@ def _check(asked: SimulateOptions) -> None:
         )
     kind = kinds[0] if kinds else ""
     takes = _TAKES[kind]
-    tilting = {"touches", "wrong_views", "warm_up", "torques", "stiffness_knm"} & asked.given
-    if tilting and not asked.cell and arm_named(asked.robot).is_planar:
+    tilting = {"touches", "wrong_views", "warm_up", "torques", "stiffness_knm"} & request.given
+    if tilting and not request.cell and arm_named(request.robot).is_planar:
         named = [_option(name) for name in sorted(tilting)]
         raise DataError(
-            f"{' and '.join(named)}: simulated for arms of six joints, and {asked.robot} has four.",
+            f"{' and '.join(named)}: simulated for arms of six joints, and "
+            f"{request.robot} has four.",
             culprits=named,
             next_step="Leave them out, or take another --robot.",
         )
-    if kind == "cell" and not asked.torques:
+    if kind == "cell" and not request.torques:
         takes = takes - {"currents"}
-    for wrong in sorted(asked.given - takes - {"folder", kind}):
+    for wrong in sorted(request.given - takes - {"folder", kind}):
         possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
         raise DataError(
             f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
@@ -180,23 +181,23 @@ def _check(asked: SimulateOptions) -> None:
         )
 
 
-def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
+def _write(cell: SimulatedCell, request: SimulateOptions) -> None:
     """Writes a cell, and its robots' touches."""
     count, depth = len(cell.sights), None
-    if asked.depth or asked.given.intersection(_DEPTH):
+    if request.depth or request.given.intersection(_DEPTH):
         depth = DepthOptions(
-            scale=asked.depth_scale,
-            offset_m=1e-3 * asked.depth_offset_mm,
-            bowl_m=1e-3 * asked.depth_bowl_mm,
-            boxed=0.5 * asked.depth_box,
+            scale=request.depth_scale,
+            offset_m=1e-3 * request.depth_offset_mm,
+            bowl_m=1e-3 * request.depth_bowl_mm,
+            boxed=0.5 * request.depth_box,
         )
     with shown_progress(quiet=False) as progress:
         write_session(
             cell,
-            asked.folder,
+            request.folder,
             lambda share: progress("render", round(share * count), count),
-            images=asked.images and not (asked.sweep or asked.warm_up),
-            touched=touch(cell) if asked.touches else None,
+            images=request.images and not (request.sweep or request.warm_up),
+            touched=touch(cell) if request.touches else None,
             depth=depth,
         )
 
@@ -213,19 +214,21 @@ def _planned(plan: Path, times: int) -> FloatArray:
         return np.repeat(np.array([stop["q"] for stop in document["stops"]]), times, axis=0)
 
 
-def _whole_cell(name: str, options: CellOptions, asked: SimulateOptions) -> SimulatedCell:
+def _whole_cell(name: str, options: CellOptions, request: SimulateOptions) -> SimulatedCell:
     """Simulates a whole cell; the user's options override its description."""
-    cell = simulate(_described(name, options, asked.given, asked.instrument))
+    cell = simulate(_described(name, options, request.given, request.instrument))
     if not (cell.sights or cell.readings):
         raise DataError(
             f"--cell {name}: nothing in this cell is seen or read.",
             culprits=[name],
             next_step="Give it a camera that sees a target, or an instrument and points.",
         )
-    if not asked.torques:
+    if not request.torques:
         return cell
     exercises = {
-        robot.name: exercise(_exercise_options(asked, robot.robot, seed_of(cell.options.seed, at)))
+        robot.name: exercise(
+            _exercise_options(request, robot.robot, seed_of(cell.options.seed, at))
+        )
         for at, robot in enumerate(cell.layout.robots)
     }
     return with_exercises(cell, exercises)

@@ -27,18 +27,20 @@ class ArmDynamics:
 
     @classmethod
     def of(cls, identified: Identified) -> Self:
-        """Builds it from identified dynamics that have physically consistent links.
+        """Builds the arm from identified dynamics that have physically consistent links.
 
         Raises:
-            DataError: They have none, because the robot's own inertias were not known.
+            DataError: No link is consistent, because the robot's own inertias were not known.
         """
         robot, parameters = identified.robot, identified.standard.values
         links = 10 * robot.joint_count
-        own = dict(zip(identified.base.model.names[links:], parameters[links:], strict=True))
+        joint_values = dict(
+            zip(identified.base.model.names[links:], parameters[links:], strict=True)
+        )
 
         def by_joint(symbol: str) -> FloatArray:
             joints = range(1, robot.joint_count + 1)
-            return np.array([own.get(f"{symbol}{joint}", 0.0) for joint in joints])
+            return np.array([joint_values.get(f"{symbol}{joint}", 0.0) for joint in joints])
 
         humps = identified.stribeck
         hump_nm, hump_speeds = np.zeros(robot.joint_count), np.ones(robot.joint_count)

@@ -294,11 +294,11 @@ def fit_consistent(
     upper = np.full(count + len(names), np.inf)
     upper[:count] = _FARTHEST
     lower = -upper
-    # Where they would be negative they are noise, or the model does not fit.
+    # Negative friction or inertia is noise, or the model does not fit.
     lower[count:][[name.startswith(_POSITIVE) for name in names]] = 0.0
     start = np.zeros(len(lower))
-    own = slopes(start)[: base.rank, count:]
-    start[count:] = np.linalg.lstsq(own, -residuals(start)[: base.rank], rcond=None)[0]
+    joint_columns = slopes(start)[: base.rank, count:]
+    start[count:] = np.linalg.lstsq(joint_columns, -residuals(start)[: base.rank], rcond=None)[0]
     # An export of what was identified waits for no optimiser.
     from scipy.optimize import least_squares
 

@@ -144,7 +144,7 @@ class _Mistake:
 def _mistakes(joints: int) -> Iterator[_Mistake]:
     """All mistakes that are tested."""
     same, every = np.eye(joints), tuple(range(joints))
-    both = []
+    double_swaps = []
     for first, second in combinations(every, 2):
         pair, swap = (first, second), same.copy()
         swap[[first, second]] = same[[second, first]]
@@ -152,8 +152,8 @@ def _mistakes(joints: int) -> Iterator[_Mistake]:
         yield _Mistake(f"the torques {words}", pair, same, swap)
         yield _Mistake(f"the angles {words}", pair, swap, same)
         words = f"joints {first + 1} and {second + 1} are swapped, with angles and torques"
-        both.append(_Mistake(words, pair, swap, swap))
-    yield from both
+        double_swaps.append(_Mistake(words, pair, swap, swap))
+    yield from double_swaps
     for joint in every:
         flip = np.diag(np.where(np.arange(joints) == joint, -1.0, 1.0))
         words = f"the torque of joint {joint + 1} has the other sign than its angle"

@@ -83,10 +83,10 @@ def _friction_words(identified: Identified, changes: FloatArray) -> str:
     names = [identified.base.model.names[index] for index in identified.base.independent]
     joints = range(1, len(changes) // 2 + 1)
     known = dict(zip(names, identified.values.tolist(), strict=True))
-    own = np.array([known.get(f"Fc{joint}", 0.0) for joint in joints])
-    if not (own > 0.0).any():
+    dry_nm = np.array([known.get(f"Fc{joint}", 0.0) for joint in joints])
+    if not (dry_nm > 0.0).any():
         return "dry friction acts otherwise, and was not fitted"
-    ratio = float(np.median(1.0 + changes[::2] / np.where(own > 0.0, own, np.inf)))
+    ratio = float(np.median(1.0 + changes[::2] / np.where(dry_nm > 0.0, dry_nm, np.inf)))
     return f"dry friction was {ratio:.3g} times as much, as of colder or warmer gears"
 
 
@@ -101,11 +101,14 @@ def scale_difference(identification: Identification) -> str:
 
     before = left(fit.residuals, fit.blocks)
     for joint in range(len(ranges_nm[0])):
-        own = np.arange(len(ranges_nm[0])) == joint
+        joint_mask = np.arange(len(ranges_nm[0])) == joint
         # With its measured torque in the regressor, the joint's rows fit any multiple of it.
         blocks = [
             replace(
-                block, x=np.concatenate([block.x, np.where(own, -block.y, 0.0)[:, :, None]], axis=2)
+                block,
+                x=np.concatenate(
+                    [block.x, np.where(joint_mask, -block.y, 0.0)[:, :, None]], axis=2
+                ),
             )
             for block in fit.blocks
         ]
@@ -125,9 +128,9 @@ def stream_differences(
 ) -> Iterator[str]:
     """Names how streams differ from the first one, whose own fit does not predict them."""
     first, *others = streams
-    alone = Options(options.terms, stribeck=False, consistent=False, checked=False)
+    basic_options = Options(options.terms, stribeck=False, consistent=False, checked=False)
     try:
-        reference = identify(robot, [first], alone).identified
+        reference = identify(robot, [first], basic_options).identified
     except (DataError, DegenerateError, np.linalg.LinAlgError):
         return
     for stream in others:

@@ -266,5 +266,5 @@ def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
     values[identified.base.independent] = identified.values
     still = np.zeros_like(dq)
     motion = JointMotion(np.zeros(len(dq)), still, dq, still)
-    own = model.terms.columns(motion) @ values[10 * model.robot.joint_count :]
-    return np.asarray(own + identified.stribeck.torques(motion))
+    linear_nm = model.terms.columns(motion) @ values[10 * model.robot.joint_count :]
+    return np.asarray(linear_nm + identified.stribeck.torques(motion))

@@ -79,7 +79,7 @@ class FrictionTerms:
             ("offset", self.offset),
             ("Ia", self.motor_inertia),
         )
-        return tuple(name for name, there in terms if there)
+        return tuple(name for name, is_fitted in terms if is_fitted)
 
     def names(self, joints: int) -> tuple[str, ...]:
         """Names of all joints' parameters: Fc1, Fv1, offset1, Fc2, ..."""
@@ -100,10 +100,10 @@ class FrictionTerms:
 
     def columns(self, motion: JointMotion) -> FloatArray:
         """Regressor (m, n, k n) of the parameters `names`: zero for those of other joints."""
-        own = self.values(motion)
-        count, joints, kinds = own.shape
+        joint_values = self.values(motion)
+        count, joints, kinds = joint_values.shape
         columns = np.zeros((count, joints, joints, kinds))
-        columns[:, range(joints), range(joints)] = own
+        columns[:, range(joints), range(joints)] = joint_values
         return columns.reshape(count, joints, joints * kinds)
 
 
@@ -165,14 +165,14 @@ class DynamicModel:
         """
         robot = self.robot
         wanted = np.arange(len(self.names)) if columns is None else columns
-        own = wanted[wanted >= 10 * robot.joint_count] - 10 * robot.joint_count
-        links = wanted[: len(wanted) - len(own)]
+        joint_columns = wanted[wanted >= 10 * robot.joint_count] - 10 * robot.joint_count
+        links = wanted[: len(wanted) - len(joint_columns)]
         # One array, parameters before joints: much faster than concatenating two.
         rows = np.empty((len(motion), len(wanted), robot.joint_count))
         torque_regressor(robot, motion.q, motion.dq, motion.ddq, links, rows)
         rows[:, len(links) :] = 0.0
         values = self.terms.values(motion)
-        for place, column in enumerate(own.tolist(), start=len(links)):
+        for place, column in enumerate(joint_columns.tolist(), start=len(links)):
             joint, kind = divmod(column, values.shape[2])
             rows[:, place, joint] = values[:, joint, kind]
         return np.swapaxes(rows, 1, 2)

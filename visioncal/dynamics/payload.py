@@ -147,9 +147,9 @@ def estimate_payload(
     for stream, block, sigma in zip(loaded, fit.blocks, fit.sigmas, strict=True):
         weights = block.used / sigma
         rows = block.x * weights[:, :, None]
-        own = stream.filtered(base.regressor) * weights[:, :, None]
+        arm_rows = stream.filtered(base.regressor) * weights[:, :, None]
         information += np.einsum("kjp,kjq->pq", rows, rows)
-        cross += rows.reshape(-1, count).T @ own.reshape(-1, base.rank)
+        cross += rows.reshape(-1, count).T @ arm_rows.reshape(-1, base.rank)
         parts += stream.of_currents * np.einsum("kjp,kj->pj", rows, block.y * weights)
     by_joint = gain_sigma * np.linalg.solve(information, parts)
     common = by_joint.sum(axis=1, keepdims=True)
@@ -195,8 +195,8 @@ def _check_plausible(
     of_links = np.where(base.independent < 10 * n, identified.values, 0.0)
     blocks = []
     for stream, block in zip(loaded, fit.blocks, strict=True):
-        own = stream.filtered(lambda motion: base.regressor(motion) @ of_links)
-        blocks.append(replace(block, x=np.concatenate([block.x, own[:, :, None]], axis=2)))
+        link_torques = stream.filtered(lambda motion: base.regressor(motion) @ of_links)
+        blocks.append(replace(block, x=np.concatenate([block.x, link_torques[:, :, None]], axis=2)))
     scaled = regress(blocks)
     change, sigma = float(scaled.values[-1]), float(np.sqrt(scaled.covariance[-1, -1]))
     torques = np.concatenate([stream.torques_nm for stream in loaded])
@@ -268,7 +268,7 @@ def drive_gains(
         return np.asarray(body_regressor(robot, motion.q, motion.dq, motion.ddq) @ body)
 
     streams = (*empty, *loaded)
-    own = np.concatenate([stream.filtered(base.regressor) for stream in streams])
+    arm_regressor = np.concatenate([stream.filtered(base.regressor) for stream in streams])
     payload_torques = np.concatenate(
         [np.zeros_like(item.torques_nm) for item in empty]
         + [item.filtered(load) for item in loaded]
@@ -277,7 +277,7 @@ def drive_gains(
     used = np.concatenate([stream.used for stream in streams])
     estimates = np.array(
         [
-            _gain(own[rows, joint], payload_torques[rows, joint], currents[rows, joint])
+            _gain(arm_regressor[rows, joint], payload_torques[rows, joint], currents[rows, joint])
             for joint, rows in enumerate(used.T)
         ]
     )
@@ -343,12 +343,14 @@ def check_gains(gains: Gains, base: BaseModel, empty: Sequence[Conditioned]) -> 
     return tuple(doubts)
 
 
-def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[float, float, float]:
+def _gain(
+    regressor: FloatArray, load: FloatArray, currents: FloatArray
+) -> tuple[float, float, float]:
     """A joint's gain, its sigma and misfit, by regressor (m, b), payload torques and currents."""
     size = max(float(np.std(currents)), 1e-12)
-    effective = own.any(axis=0)
-    lengths = np.linalg.norm(own[:, effective], axis=0)
-    directions, upper, _ = qr(own[:, effective] / lengths, mode="economic", pivoting=True)
+    effective = regressor.any(axis=0)
+    lengths = np.linalg.norm(regressor[:, effective], axis=0)
+    directions, upper, _ = qr(regressor[:, effective] / lengths, mode="economic", pivoting=True)
     pivots = np.abs(np.diag(upper))
     directions = directions[:, pivots > 1e-8 * pivots[0]]
     load = load - directions @ (directions.T @ load)

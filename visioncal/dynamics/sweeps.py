@@ -228,7 +228,11 @@ def _sampled(home: FloatArray, strokes: tuple[Stroke, ...], rate_hz: float) -> J
     rows = np.searchsorted(times, begins)
     for place, stroke in enumerate(strokes):
         # The very last sample belongs to the rest after the last stroke.
-        own = slice(rows[place], rows[place + 1] if place + 1 < len(strokes) else None)
-        at = stroke.at(times[own] - begins[place])
-        q[own, stroke.joint], dq[own, stroke.joint], ddq[own, stroke.joint] = at
+        stroke_rows = slice(rows[place], rows[place + 1] if place + 1 < len(strokes) else None)
+        at = stroke.at(times[stroke_rows] - begins[place])
+        (
+            q[stroke_rows, stroke.joint],
+            dq[stroke_rows, stroke.joint],
+            ddq[stroke_rows, stroke.joint],
+        ) = at
     return JointMotion(times, q, dq, ddq)

@@ -80,7 +80,7 @@ def touched_fixture(
 
     Raises:
         DataError: Touches are missing, wrongly written, or contradict each other or the drawing.
-        DegenerateError: They do not determine the fixture in every direction.
+        DegenerateError: Touches do not determine the fixture in every direction.
     """
     if drawing is None:
         rows = rows.of_kinds(
@@ -116,11 +116,11 @@ def touched_fixture(
     try:
         return drawn_fixture(measured, drawing, setting)
     except DataError as error:
-        beside = drawing.beside(measured.names, measured.points, measured.scattered)
+        drawn_pairs = drawing.pairs_of(measured.names, measured.points, measured.scattered)
         poses = rows.base_from_flange
         if tool is not None:
             poses = flange_poses(rows, robot, calibration)
-        raise with_other_tip(error, beside, poses, tool) from error
+        raise with_other_tip(error, drawn_pairs, poses, tool) from error
 
 
 def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: FitSettings) -> Frame:
@@ -201,9 +201,9 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
 
     Raises:
         DataError: A point is not drawn, or the points do not fit the drawing.
-        DegenerateError: They do not determine the fixture in every direction.
+        DegenerateError: Touches do not determine the fixture in every direction.
     """
-    pairs = drawing.beside(measured.names, measured.points, measured.scattered)
+    pairs = drawing.pairs_of(measured.names, measured.points, measured.scattered)
     mistake = mistake_of(pairs)
     named = () if mistake is None else (_finding_of(mistake, drawing),)
     try:

@@ -106,7 +106,7 @@ def seen_frame(
     other: FrameKind = "fixture" if kind == "tool" else "tool"
     elsewhere = PARENTS[other]
     has_poses = all(sight.base_from_flange is not None for sight in sights)
-    # So much wilder than the noise: it may be fixed to the other parent, and calm against that.
+    # With so much scatter, the target may be fixed to the other parent, and calm against that.
     if seen.scatter >= _WILD and (has_poses or not needs_robot(eye, elsewhere)):
         alternative = place_target(eye, sights, looks, elsewhere)
         if alternative.rms_mm < 0.1 * seen.rms_mm:
@@ -119,10 +119,12 @@ def seen_frame(
                 culprits=[shown.source],
                 next_step=f"Run visioncal {_COMMANDS[other]} instead.{lying * (other == 'tool')}",
             )
-    own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
+    independent, common = (
+        float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common)
+    )
     advice = (
         "Take more images, from nearer and from other sides."
-        if own > common
+        if independent > common
         else "Most of it is the same in all images (the camera's calibration, the target's size, "
         "the arm's errors): a better calibration helps, more images do not."
     )
@@ -151,7 +153,7 @@ def seen_frame(
         method += f"; its point ({', '.join(f'{value:.6g}' for value in point_mm)}) mm"
         details["point_target_mm"] = point_mm.tolist()
     # Noise of one image per axis: from the scatter, or predicted for a single image.
-    noise_mm = 1e3 * np.sqrt(own / 3)
+    noise_mm = 1e3 * np.sqrt(independent / 3)
     if count > 1:
         noise_mm = np.sqrt(np.sum(seen.away_mm[seen.inliers] ** 2) / (3 * (count - 1)))
     praise = (
@@ -172,7 +174,7 @@ def seen_frame(
         | {
             "rms_deg": seen.rms_deg,
             "scatter_over_expected": seen.scatter,
-            "sigma_by_images_mm": float(1e3 * np.sqrt(own)),
+            "sigma_by_images_mm": float(1e3 * np.sqrt(independent)),
             "sigma_in_common_mm": float(1e3 * np.sqrt(common)),
             SEEN_BY: calibration.created,
             "note": _COUNTED_TWICE,

@@ -115,15 +115,17 @@ def locate_by_depth(
         model = DepthResult.exact()
         unread = "The calibration's views had no depth: it is taken as it was measured."
     # The depth is by the camera of depth, in whose pixels the model is.
-    by, beside = (eye.camera if model.by is None else model.by.camera), model.beside
+    by, cam_from_depth = (eye.camera if model.by is None else model.by.camera), model.cam_from_depth
     cross = np.zeros((5, len(eye.covariance)))
     if model.with_calibration is not None:
         # Between the camera's edge and the lens is the board's.
         cross = np.delete(model.with_calibration, np.s_[6:12], axis=1)
     for at, ray, metres in zip(px, rays, measured, strict=True):
         along = float(np.linalg.norm(ray)) if model.of == "ray" else 1.0
-        placed, where = model.corrected(apply(invert(beside), (metres / along * ray)[None]), by)
-        (depth,) = apply(beside, placed)[:, 2]
+        placed, where = model.corrected(
+            apply(invert(cam_from_depth), (metres / along * ray)[None]), by
+        )
+        (depth,) = apply(cam_from_depth, placed)[:, 2]
         noise_m = model.noise_at(depth * along) / along
         by_depth = -model.by_values(depth[None] * along, where, by.resolution).T / along
         # The first ray is for the mean distance, as in `_on_plane`.
@@ -167,10 +169,10 @@ def seen_distances(
         u, v = np.clip(np.rint(px), 0, np.array(eye.camera.resolution) - 1).astype(int).T
         return np.asarray(depth_m[v, u])
     rows, columns = np.nonzero(np.isfinite(depth_m))
-    own = normalise(model.by.camera, np.column_stack([columns, rows]).astype(float))
-    rays = np.column_stack([own, np.ones(len(own))])
+    normalised = normalise(model.by.camera, np.column_stack([columns, rows]).astype(float))
+    rays = np.column_stack([normalised, np.ones(len(normalised))])
     lengths = np.linalg.norm(rays, axis=1, keepdims=True) if model.of == "ray" else 1.0
-    points = apply(model.beside, rays * depth_m[rows, columns][:, None] / lengths)
+    points = apply(model.cam_from_depth, rays * depth_m[rows, columns][:, None] / lengths)
     distances = np.linalg.norm(points, axis=1) if model.of == "ray" else points[:, 2]
     seen, found = project(eye.camera, points), np.full(len(px), np.nan)
     # One and a half pixels of the depth picture.
@@ -209,7 +211,7 @@ def cloud_in_base(
     if model is not None:
         by = eye.camera if model.by is None else model.by.camera
         points_cam = model.corrected(points_cam.reshape(-1, 3), by)[0].reshape(points_cam.shape)
-        pose = pose @ model.beside
+        pose = pose @ model.cam_from_depth
     return np.asarray(points_cam @ pose[:3, :3].T + pose[:3, 3])
 
 
@@ -320,10 +322,10 @@ def _camera_parts(
     by_calibration = np.concatenate([by_camera, by_lens, calibrated], axis=1)
     covariance = eye.shared_covariance
     if depth is not None:
-        by_depth, own, cross = depth
+        by_depth, depth_covariance, cross = depth
         by_calibration = np.concatenate([by_calibration, by_depth], axis=1)
         cross = np.pad(cross, ((0, 0), (0, len(covariance) - cross.shape[1])))
-        covariance = np.block([[covariance, cross.T], [cross, own]])
+        covariance = np.block([[covariance, cross.T], [cross, depth_covariance]])
     return {
         "calibration": _mapped(by_calibration, covariance),
         "robot": _mapped(flange_jacobian, cam_pose.flange_noise),

@@ -219,7 +219,7 @@ def fit_pivot(
 
     Raises:
         DataError: Touches are missing, or lie on both sides of the tip.
-        DegenerateError: They leave a direction undetermined; named with its predicted sigma.
+        DegenerateError: Touches leave a direction undetermined; named with its predicted sigma.
     """
     _check_counts(touches)
     tips = touches.are("point")
@@ -250,8 +250,8 @@ def fit_pivot(
 
         def worst(covariance: FloatArray) -> tuple[Direction, ...]:
             of_tool = edge_covariance(covariance)
-            both = worst_of(fit.state.frame, of_tool, "tool", "flange", origin="tip")
-            return both if problem.oriented else both[:1]
+            directions = worst_of(fit.state.frame, of_tool, "tool", "flange", origin="tip")
+            return directions if problem.oriented else directions[:1]
 
         refuse_poor("tcp", fit, worst, partial(_cause, touches, fit))
         local = problem.local(fit.state)

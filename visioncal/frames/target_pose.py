@@ -209,8 +209,10 @@ class _ImageSearch:
         rooted = by_common @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         against = weights @ rooted
         inner = np.einsum("mij,mik->jk", rooted, against) + np.eye(len(values))
-        own = weights - against.sum(axis=0) @ np.linalg.solve(inner, np.swapaxes(against, 1, 2))
-        gains = covariance_from(own.sum(axis=0)) @ own
+        net_weights = weights - against.sum(axis=0) @ np.linalg.solve(
+            inner, np.swapaxes(against, 1, 2)
+        )
+        gains = covariance_from(net_weights.sum(axis=0)) @ net_weights
         matrix = matrices[int(np.flatnonzero(agrees)[0])]
         # The mean converges in a few steps, since the poses are near each other.
         for _round in range(10):

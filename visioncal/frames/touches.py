@@ -215,18 +215,18 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
             culprits=[rows.source],
         )
     poses[has_joints] = robot.base_from_flange(rows.joints_rad[has_joints])
-    both = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
-    delta = invert(poses[both]) @ rows.base_from_flange[both]
+    paired_rows = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
+    delta = invert(poses[paired_rows]) @ rows.base_from_flange[paired_rows]
     off_m, off_rad = np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta)
     # Farther apart than any arm errs, the row's pose is of another arm or frame [m, rad].
     odd = np.flatnonzero((off_m > 0.05) | (off_rad > 0.1))
     if len(odd):
         at = odd[0]
         raise DataError(
-            f"{rows.places[both[at]]}: the joints lead through {robot.name} to a flange "
+            f"{rows.places[paired_rows[at]]}: the joints lead through {robot.name} to a flange "
             f"{1e3 * off_m[at]:.0f} mm and {np.rad2deg(off_rad[at]):.1f} deg away from "
             "the pose that is reported.",
-            culprits=[rows.places[index] for index in both[odd]],
+            culprits=[rows.places[index] for index in paired_rows[odd]],
             next_step="Check the robot's model and its base, and whether the controller reports "
             "the flange without a tool.",
         )
@@ -377,7 +377,7 @@ class NominalPoints:
     positions: FloatArray  # (n, 3) [m] in the drawing's frame.
     sigma_m: FloatArray  # (n,) standard deviation of each coordinate [m]; 0 where taken as exact.
 
-    def beside(
+    def pairs_of(
         self, names: Sequence[str], measured: FloatArray, covariances: FloatArray
     ) -> PointPairs:
         """Pairs measured points with the drawn ones of the same names.
@@ -385,7 +385,7 @@ class NominalPoints:
         Upper and lower case are the same where the match is unique.
 
         Args:
-            names: (m,) which point each is; names may repeat.
+            names: (m,) names of the measured points; names may repeat.
             measured: (m, 3) in the base [m].
             covariances: (m, 3, 3) of their known noise [m^2].
 

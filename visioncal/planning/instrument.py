@@ -155,7 +155,7 @@ def plan_for_instrument(
                     cell, purpose, criterion, q, via, design, candidates, recorded
                 )
             chosen = left[design.rows]
-            left = left_candidates(candidates, left, chosen, route, alone=not attempt)
+            left = left_candidates(candidates, left, chosen, route, missed_only=not attempt)
             if len(left) < count:
                 break
     raise DataError(

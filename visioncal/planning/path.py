@@ -115,7 +115,7 @@ class Route:
 
 
 def left_candidates(
-    q: FloatArray, left: IntArray, chosen: IntArray, route: Route, *, alone: bool
+    q: FloatArray, left: IntArray, chosen: IntArray, route: Route, *, missed_only: bool
 ) -> IntArray:
     """Candidates from which to choose again, where a route misses chosen stops.
 
@@ -124,12 +124,12 @@ def left_candidates(
         left: Rows of the candidates.
         chosen: (s,) rows of the stops.
         route: Its path.
-        alone: Whether only the missed stops go. Otherwise all go that are nearer to these than to
-            reached ones, since each would be replaced by another in the same part of the workspace.
+        missed_only: Whether only the missed stops go. Otherwise all nearer to these than to reached
+            ones go, too, since another in the same part of the workspace would replace each.
     """
     missed = chosen[list(route.unreachable)]
     reached = np.setdiff1d(chosen, missed)
-    if not alone and len(reached):
+    if not missed_only and len(reached):
         to_missed, to_reached = (
             np.linalg.norm(q[left][:, None] - q[rows], axis=2).min(axis=1)
             for rows in (missed, reached)

@@ -113,11 +113,15 @@ class Picking:
         chances = []
         for (jacobian, noise), world in zip(self._sights, self.worlds, strict=True):
             covariance = world.covariance(rows)
-            by_size, own = covariance[:, self._held], np.diag(covariance)[self._held]
-            square = chi2_limit(_LARGER_NOISE, 1) * own if size_share is None else size_share**2
+            by_size, held_variances = covariance[:, self._held], np.diag(covariance)[self._held]
+            square = (
+                chi2_limit(_LARGER_NOISE, 1) * held_variances
+                if size_share is None
+                else size_share**2
+            )
             # A verdict counts what the stops show of a held size by chance: its square is one of
             # a normal variable.
-            covariance = growth * covariance + (by_size * square / own**2) @ by_size.T
+            covariance = growth * covariance + (by_size * square / held_variances**2) @ by_size.T
             if known is not None and len(known):
                 cross = covariance[:, known]
                 covariance = covariance - cross @ np.linalg.solve(cross[known], cross.T)

@@ -194,7 +194,7 @@ class _Planning:
                 return design, route, tuple(blockers)
             blockers += route.unreachable.values()
             remaining = left_candidates(
-                self.found.q, remaining, design.rows, route, alone=not attempt
+                self.found.q, remaining, design.rows, route, missed_only=not attempt
             )
         obstacles = tuple(dict.fromkeys(blockers))
         raise DataError(

@@ -219,14 +219,17 @@ def _missing_input_error(run: RunState) -> DataError:
 
 def _missing_model_error(session: Session) -> DataError:
     forms = {table.form for table in session.robots.values()}
-    own = [name for name in robot_names() if (form := controller_form(name)) and form.name in forms]
+    maker_robots = [
+        name for name in robot_names() if (form := controller_form(name)) and form.name in forms
+    ]
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without a model of its robot, "
         "which says where the arm reaches.",
         culprits=[f"session {session.name!r}"],
         next_step="Name the arm in session.toml ([robot] model), or by --robot; that of a whole "
         "cell in its own table, as model in [robots.a]. Built in are "
-        f"{', '.join(own or robot_names())}; any other by its .urdf, or a DH table (.toml).",
+        f"{', '.join(maker_robots or robot_names())}; any other by its .urdf, or a DH "
+        "table (.toml).",
     )
 
 

@@ -31,9 +31,9 @@ class _Compiled(FileSystemBytecodeCache):
 
 def templates_of(folder: str, **options: Any) -> Environment:  # noqa: ANN401 - jinja2's own
     """The environment of the templates in a folder of the package, in which no name is unknown."""
-    beside = Path(cache_from_source(__file__)).parent
+    cache_folder = Path(cache_from_source(__file__)).parent
     environment = Environment(
-        bytecode_cache=None if sys.dont_write_bytecode else _Compiled(str(beside)),
+        bytecode_cache=None if sys.dont_write_bytecode else _Compiled(str(cache_folder)),
         loader=PackageLoader("visioncal", folder),
         undefined=StrictUndefined,
         trim_blocks=True,

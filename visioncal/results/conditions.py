@@ -35,11 +35,11 @@ def uncorrected_words(verdict: Verdict) -> str:
     words = "The transforms belong to the calibrated arm, not to the controller's model of it"
     if verdict.good_for_mm is None or verdict.good_for_mm_uncorrected is None:
         return f"{words}."
-    own, corrected = (
+    uncorrected, corrected = (
         figure(rounded_up(mm)) for mm in (verdict.good_for_mm_uncorrected, verdict.good_for_mm)
     )
     return (
-        f"{words}: 95 % of picks by the controller's own poses land within {own} mm, with "
+        f"{words}: 95 % of picks by the controller's own poses land within {uncorrected} mm, with "
         f"corrected targets within {corrected} mm."
     )
 

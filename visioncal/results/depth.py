@@ -63,7 +63,7 @@ class DepthResult:
         )  # fmt: skip
 
     @property
-    def beside(self) -> FloatArray:
+    def cam_from_depth(self) -> FloatArray:
         """(4, 4) pose of the camera that measures depth, in that of the images."""
         return np.eye(4) if self.by is None else self.by.cam_from_depth
 

@@ -143,7 +143,7 @@ def entries_of(calibration: Calibration) -> Iterator[Entry]:
     }
     children = {name: name.partition("_from_")[2] for name in calibration.edges}
     targets = frames_of_kind(children.values(), "target")
-    own = Entry(
+    calibrated = Entry(
         cell=calibration.session_name,
         at=_utc(calibration.created),
         kind="calibrated",
@@ -163,21 +163,21 @@ def entries_of(calibration: Calibration) -> Iterator[Entry]:
             if value is not None and math.isfinite(value)
         },
     )
-    yield own
+    yield calibrated
     for name, frame in calibration.frames.items():
         yield entry_of_frame(name, frame, calibration)
     if (test := calibration.touch_test) is not None:
         gaps = [point.gap_mm for point in test.points]
         outcome = "as" if test.passed else "larger than"
         yield Entry(
-            cell=own.cell,
+            cell=calibrated.cell,
             at=_utc(test.created),
             kind="touched",
             status="good" if test.passed else "bad",
             reason=f"Touched with {test.named_tool}: the largest gap is {max(gaps):.2f} mm, "
             f"{outcome} predicted.",
-            session=own.session,
-            against=own.sha256,
+            session=calibrated.session,
+            against=calibrated.sha256,
         )
 
 
@@ -318,13 +318,13 @@ class History:
             raise self._refusal(why, do) from error
 
     def _connected(self, mode: str) -> sqlite3.Connection:
-        address, beside = self.path.absolute().as_uri(), Path(f"{self.path}-wal")
+        address, log_path = self.path.absolute().as_uri(), Path(f"{self.path}-wal")
         check_journal(self.path)
         try:
             return _connection(f"{address}?mode={mode}")
         except sqlite3.OperationalError as error:
-            # In a read-only place there is no room for the files beside it; nobody writes there.
-            is_closed = not beside.exists() or not beside.stat().st_size
+            # A read-only place has no room for files beside the history; nobody writes there.
+            is_closed = not log_path.exists() or not log_path.stat().st_size
             read_only = (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
             if mode != "rw" or error.sqlite_errorcode & 0xFF not in read_only or not is_closed:
                 raise

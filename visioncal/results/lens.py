@@ -196,8 +196,8 @@ class CameraResult:
         edges, field = self.edge_covariance, self.field
         if field is not None:
             # Without coefficients, the number of edges is not in the file.
-            beside = field.edge_covariance.reshape(-1, jacobian.shape[1])
-            field = replace(field, edge_covariance=beside @ jacobian.T)
+            field_covariance = field.edge_covariance.reshape(-1, jacobian.shape[1])
+            field = replace(field, edge_covariance=field_covariance @ jacobian.T)
         edges = None if edges is None else edges @ jacobian.T
         return replace(self, edge_covariance=edges, field=field)
 

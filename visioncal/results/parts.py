@@ -83,8 +83,10 @@ class NeedMet:
 
     def of(self, camera: str, robot: str) -> "NeedMet":
         """The probability of one camera and robot; of all where they are no pair."""
-        mine = [pair for pair in self.pairs if (pair.camera, pair.robot) == (camera, robot)]
-        return NeedMet(self.need, mine[0].probability) if mine else self
+        matching_pairs = [
+            pair for pair in self.pairs if (pair.camera, pair.robot) == (camera, robot)
+        ]
+        return NeedMet(self.need, matching_pairs[0].probability) if matching_pairs else self
 
 
 @dataclass(frozen=True, kw_only=True)

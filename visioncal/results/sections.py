@@ -252,9 +252,10 @@ class JointFit(Section):
         if self.arm is None or not self.arm.hidden:
             return self
         count = len(self.covariance) - len(self.arm.values)
-        cross, own = self.covariance[:count, count:], self.covariance[count:, count:]
+        cross, arm_block = self.covariance[:count, count:], self.covariance[count:, count:]
         left = (
-            self.covariance[:count, :count] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
+            self.covariance[:count, :count]
+            - cross @ np.linalg.pinv(arm_block, hermitian=True) @ cross.T
         )
         stops = self.stops
         if stops is not None:

@@ -95,10 +95,10 @@ def _course(name: str, entries: Sequence[Entry]) -> Course:
     matrices = np.array([edge.matrix for edge in edges])
     rotations = log(matrices @ invert(matrices[:1]))[:, :3]
     offsets = np.hstack([rotations, matrices[:, :3, 3] - matrices[0, :3, 3]])[:, part]
-    # Those of edges are in the axes of the child.
+    # Edges' covariances are in the axes of the child.
     turned = np.array([np.kron(np.eye(2), matrix[:3, :3]) for matrix in matrices])
-    own = np.array([edge.covariance for edge in edges])
-    covariances = (turned @ own @ turned.swapaxes(1, 2))[:, part, part]
+    child_covariances = np.array([edge.covariance for edge in edges])
+    covariances = (turned @ child_covariances @ turned.swapaxes(1, 2))[:, part, part]
     changes = sigma_changes = tuple[Change, ...]()
     if len(entries) > 1:
         days = np.array([(entry.time - entries[0].time) / timedelta(days=1) for entry in entries])
@@ -187,8 +187,8 @@ class _Model:
             found: Sizes by change.
         """
         others = np.array([*range(self.level), self.none])
-        beside = np.tile([self.level, *found], (len(others), 1))
-        matrix, right = self._equations(np.column_stack([beside, others]))
+        found_columns = np.tile([self.level, *found], (len(others), 1))
+        matrix, right = self._equations(np.column_stack([found_columns, others]))
         scores = np.empty((len(_SIZES), len(_INFLATIONS), len(others)))
         for at, size in enumerate(_SIZES):
             # A level within some metres: as good as flat.

@@ -298,9 +298,9 @@ class Collisions:
         margin_m = np.array([self._distances(posture) for posture in postures]) - pairs.needed_m
         near_share = (margin_m < SLACK_M).mean(axis=0)
         kinds = [(body.of_arm, body.link > 0, body.link == 1) for body in bodies]
-        both = np.array([*kinds, (False, False, False)])[pairs.bodies]
-        of_arm, moving, _ = np.asarray(both.all(axis=1)).T
-        on_first_link = both[..., 2].any(axis=1)
+        pair_kinds = np.array([*kinds, (False, False, False)])[pairs.bodies]
+        of_arm, moving, _ = np.asarray(pair_kinds.all(axis=1)).T
+        on_first_link = pair_kinds[..., 2].any(axis=1)
         # A cell body that a later link touches in every posture is an error, and must be reported.
         always_near = (near_share == 1.0) & (of_arm | moving | on_first_link)
         # Parts that are near in a larger share of postures are so by design: the joints' limits

@@ -193,17 +193,17 @@ class LogCholesky:
         """Inertial parameters (n, 10) of (n, 10) coordinates."""
         import pinocchio as pin
 
-        own = [
+        parameters = [
             pin.LogCholeskyParameters(coordinate).toDynamicParameters()
             for coordinate in coordinates
         ]
-        return np.asarray((self.maps @ np.array(own)[:, :, None])[:, :, 0])
+        return np.asarray((self.maps @ np.array(parameters)[:, :, None])[:, :, 0])
 
     def jacobians(self, coordinates: FloatArray) -> FloatArray:
         """Jacobians (n, 10, 10) of the parameters over the coordinates."""
         import pinocchio as pin
 
-        own = [
+        derivatives = [
             pin.LogCholeskyParameters(coordinate).calculateJacobian() for coordinate in coordinates
         ]
-        return np.asarray(self.maps @ np.array(own))
+        return np.asarray(self.maps @ np.array(derivatives))

@@ -223,10 +223,10 @@ class Inverse:
         """Jacobian (6, n) of the error at the posture of the last call of `_error`."""
         import pinocchio as pin
 
-        own = pin.getFrameJacobian(self._model, self._data, self._frame, pin.LOCAL)
-        jacobian: FloatArray = np.empty_like(own)
-        np.matmul(rotation, own[:3], out=jacobian[:3])
-        np.matmul(weight * pin.Jlog3(rotation), own[3:], out=jacobian[3:])
+        frame_jacobian = pin.getFrameJacobian(self._model, self._data, self._frame, pin.LOCAL)
+        jacobian: FloatArray = np.empty_like(frame_jacobian)
+        np.matmul(rotation, frame_jacobian[:3], out=jacobian[:3])
+        np.matmul(weight * pin.Jlog3(rotation), frame_jacobian[3:], out=jacobian[3:])
         return jacobian
 
 

@@ -337,7 +337,7 @@ def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
     centres = (rotation @ masses.centres_m[:, :, None])[:, :, 0] + position
     about = rotation @ inertias.about_centres @ np.swapaxes(rotation, 1, 2)
     rows = zip(document["joint"], Inertias.of_bodies(masses.kg, centres, about).rows(), strict=True)
-    joints: list[dict[str, Any]] = [{**row, **own} for row, own in rows]
+    joints: list[dict[str, Any]] = [{**row, **inertial} for row, inertial in rows]
     return Robot.from_document(document | {"joint": joints})
 
 
@@ -365,11 +365,11 @@ def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = 
     root, joints = joints_of(text)
     links = {link.get("name", ""): link for link in root.iterfind("link")}
     moving = [end_of(joints[joint], "child") for joint in robot.joint_names]
-    for own in moving:
-        for name in _moving_with(own, joints, robot.joint_names):
+    for link_name in moving:
+        for name in _moving_with(link_name, joints, robot.joint_names):
             for former in links[name].findall("inertial"):
                 links[name].remove(former)
-    _add_inertials([links[own] for own in moving], inertias)
+    _add_inertials([links[link_name] for link_name in moving], inertias)
     return _with_comments(root, comment_texts(robot, notes))
 
 

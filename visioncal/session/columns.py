@@ -157,8 +157,8 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
     wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
     gaps = [name for name in wanted if name not in joints]
     if gaps:
-        beside = of_other_units(gaps, columns)
-        yield f"the joint columns {', '.join(joints)} lack {', '.join(gaps)}{beside}"
+        unit_note = of_other_units(gaps, columns)
+        yield f"the joint columns {', '.join(joints)} lack {', '.join(gaps)}{unit_note}"
     for group in WHOLE_GROUPS:
         missing = [name for name in group if name not in columns]
         if 0 < len(missing) < len(group):

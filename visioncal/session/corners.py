@@ -101,9 +101,9 @@ def parse_corners(text: str) -> CornerTable:
     other = [column for column in columns if column not in known or columns.count(column) > 1]
     if missing or other:
         hints = [word for word in (did_you_mean(name, known) for name in other) if word]
-        there = f"its columns are {', '.join(columns)}" if any(columns) else "it is empty"
+        header_words = f"its columns are {', '.join(columns)}" if any(columns) else "it is empty"
         raise DataError(
-            f"{FILE}, header: {there}; {', '.join(_NEEDED)} are "
+            f"{FILE}, header: {header_words}; {', '.join(_NEEDED)} are "
             f"needed, {COLUMN} and {_SIGMA} are optional, and others are not read.",
             culprits=[f"{FILE}: {name}" for name in (*missing, *other)],
             next_step=hints[0] if hints else f"Begin {FILE} with the line {','.join(_NEEDED)}.",

@@ -119,7 +119,7 @@ def _checked(depth: FloatArray, path: str) -> FloatArray:
 def read_cloud(data: bytes, path: str) -> FloatArray:
     """Points of a .ply, .pcd or .npy in the camera's frame, NaN where there are none.
 
-    They are in metres, or in millimetres where metres would be too far.
+    Coordinates are in metres, or in millimetres where metres would be too far.
 
     Args:
         data: Bytes of the file.
@@ -140,11 +140,11 @@ def read_cloud(data: bytes, path: str) -> FloatArray:
             culprits=[path],
             next_step="Save it as binary .ply with x, y, z, or as .npy of (h, w, 3).",
         ) from None
-    there = np.isfinite(points).all(axis=-1) & (points != 0.0).any(axis=-1)
-    if not there.any():
+    is_valid = np.isfinite(points).all(axis=-1) & (points != 0.0).any(axis=-1)
+    if not is_valid.any():
         raise DataError(f"{path} holds no point: all are NaN or 0.", culprits=[path])
-    unit_m = 1.0 if np.median(np.abs(points[..., 2][there])) < _FARTHEST_M else 0.001
-    return np.where(there[..., None], points * unit_m, np.nan)
+    unit_m = 1.0 if np.median(np.abs(points[..., 2][is_valid])) < _FARTHEST_M else 0.001
+    return np.where(is_valid[..., None], points * unit_m, np.nan)
 
 
 def _of_npy(data: bytes) -> FloatArray:

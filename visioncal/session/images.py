@@ -82,9 +82,9 @@ class FolderImages(ImageStore):
         why_not = absence(file)
         if why_not:
             return why_not.replace("does not exist", "is missing")
-        beside = self.folder.resolve().parent
-        # Directly below the root, everything would be beside it.
-        is_beside = beside != beside.parent and is_inside(file.parent, beside)
+        parent = self.folder.resolve().parent
+        # Directly below the root, everything would be beside the folder.
+        is_beside = parent != parent.parent and is_inside(file.parent, parent)
         if not is_inside(file, file.parent if is_beside else self.folder):
             return (
                 "is a link that leads out of the session's folder, and is not followed: copy the "

@@ -45,8 +45,12 @@ def observations_of(
         # Rows that contradict the majority's pose are of another state of the cell.
         states: dict[tuple[int, ...], int] = {}
         for view in rows:
-            own = {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
-            strays = {name: row for name, row in own.items() if _differ(row, robot_rows[name])}
+            posed_rows = (
+                {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
+            )
+            strays = {
+                name: row for name, row in posed_rows.items() if _differ(row, robot_rows[name])
+            }
             by_robot = {**robot_rows, **strays}
             key = tuple(by_robot[name].number for name in sorted(by_robot))
             seer, seen = observed(declaration, view)
@@ -76,9 +80,9 @@ def _still_since(views: Iterable[View]) -> dict[int, int]:
     first: View | None = None
     last_s: float | None = None
     for view in views:
-        both = view.stamp_s is not None and last_s is not None
+        has_times = view.stamp_s is not None and last_s is not None
         # Two minutes apart, the robot may have moved in between.
-        is_late = both and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > 120.0
+        is_late = has_times and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > 120.0
         if first is None or moved(first, view) or is_late:
             first = view
         last_s, run_starts[view.number] = view.stamp_s, first.number
@@ -131,10 +135,14 @@ def _stops(
     for view in views:
         if view.stop is None and not view.is_of_lens and has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
-    since = {row: first for own in rows_of.values() for row, first in _still_since(own).items()}
+    since = {
+        row: first
+        for robot_views in rows_of.values()
+        for row, first in _still_since(robot_views).items()
+    }
     for view in views:
-        alone = view.stop is None or view.is_of_lens
-        key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
+        is_single = view.stop is None or view.is_of_lens
+        key = (1, since.get(view.number, view.number)) if is_single else (0, view.stop or 0)
         groups.setdefault(key, []).append(view)
     return [(rows, _robot_rows(declaration, rows)) for rows in groups.values()]
 
@@ -145,9 +153,9 @@ def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, Vie
         if has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
     majority = {}
-    for robot, own in rows_of.items():
-        counts = Counter(view.robot_cells for view in own)
-        first = {view.robot_cells: view for view in own[::-1]}
+    for robot, robot_views in rows_of.items():
+        counts = Counter(view.robot_cells for view in robot_views)
+        first = {view.robot_cells: view for view in robot_views[::-1]}
         votes = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
         )

@@ -34,8 +34,8 @@ def session_text(path: Path) -> str:
         # The session's folder above, below, or beside it under a similar name.
         found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
         if not path.exists():
-            beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
-            found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
+            siblings = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
+            found += [siblings[name] for name in get_close_matches(path.name, siblings, 1)]
         near = next((file.parent for file in found if file.is_file()), None)
         if near is None and not (path.exists() and error.message.endswith("does not exist.")):
             raise

@@ -144,8 +144,8 @@ def _combinations(
                 continue
             mount: Mount = "eye-in-hand" if between else "eye-to-hand"
             for target in (*by_part["target"], ""):
-                both = camera and target and parted
-                if not both or robots_between(frames, camera, target) == (robot,):
+                is_pair = camera and target and parted
+                if not is_pair or robots_between(frames, camera, target) == (robot,):
                     yield Chosen(mount if camera else "instrument", camera, robot, target)
 
 
@@ -313,8 +313,8 @@ def is_whole_cell(session: SessionContent) -> bool:
 
     This includes a camera with an instrument, where the session has `[frames]`.
     """
-    both = bool(session.cameras and session.instruments)
-    return bool(_whole_cell_words(session)) or (both and bool(session.declaration.frames))
+    has_both_kinds = bool(session.cameras and session.instruments)
+    return bool(_whole_cell_words(session)) or (has_both_kinds and bool(session.declaration.frames))
 
 
 def must_select_one(session: SessionContent, choice: Choice) -> bool:

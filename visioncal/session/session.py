@@ -208,15 +208,15 @@ class Session(SessionContent):
                 declared.
 
         Raises:
-            DataError: One is not a number above 0.
+            DataError: A value is not a number above 0.
         """
-        asked: dict[str, float | bool] = {"corrected": True} if corrected else {}
+        stated_need: dict[str, float | bool] = {"corrected": True} if corrected else {}
         for name, value in (("mm", mm), ("deg", deg)):
             if value is not None:
-                asked[name] = float(value)
-        if not asked:
+                stated_need[name] = float(value)
+        if not stated_need:
             return self
-        table = {**self.document.get("need", {}), **asked}
+        table = {**self.document.get("need", {}), **stated_need}
         session = replace(self, document={**self.document, "need": table})
         _ = session.declaration  # checks it
         return session

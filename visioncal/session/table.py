@@ -154,10 +154,12 @@ def check_two_sides(name: str, views: Sequence[View], next_step: str) -> None:
     seen_poses = {view.number: view.matrix(cols.MEASURED_CAM_POSE) for view in views}
     given = {number: pose for number, pose in seen_poses.items() if pose is not None}
     reported = reported_matrices(views) if given else {}
-    both = [number for number in given if number in reported]
-    if len(both) < FEWEST_VIEWS:
+    paired_numbers = [number for number in given if number in reported]
+    if len(paired_numbers) < FEWEST_VIEWS:
         return
-    robot, camera = (np.array([poses[number] for number in both]) for poses in (reported, given))
+    robot, camera = (
+        np.array([poses[number] for number in paired_numbers]) for poses in (reported, given)
+    )
     if np.ptp(robot[:, :3, 3], axis=0).max() < _MOVED_M:
         return
     places, inverse = robot[:, :3, 3], invert(robot)[:, :3, 3]

@@ -210,8 +210,8 @@ class CornerStack:
         products = np.empty((len(ends) - 1, 2 * size, modes.shape[1]))
         for (start, end), value in zip(pairwise((ends - ends[0]).tolist()), products, strict=True):
             np.matmul(flat[start:end].T, modes[start:end], out=value)
-        both = products.reshape(len(products), 2, size, -1)
-        return np.concatenate([both[:, 0], both[:, 1]], axis=2)
+        axis_products = products.reshape(len(products), 2, size, -1)
+        return np.concatenate([axis_products[:, 0], axis_products[:, 1]], axis=2)
 
     def products_with_views(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """Products of each corner's (n, 2, j) and its view's (v, j, k): (n, 2, k)."""

@@ -80,16 +80,16 @@ def hard_matches(
     def tensor(values: npt.ArrayLike) -> "Tensor":
         return torch.as_tensor(np.asarray(values, np.float32), device=device)
 
-    both = (seen, known)
+    features = (seen, known)
     frames = [
         laf_from_center_scale_ori(
             tensor(one.px)[None],
             tensor(one.size_px)[None, :, None, None],
             tensor(one.angle_deg)[None, :, None],
         )
-        for one in both
+        for one in features
     ]
-    described = [tensor(one.described) for one in both]
+    described = [tensor(one.described) for one in features]
     with torch.inference_mode():
         _, pairs = match_adalam(*described, *frames, hw1=seen.shape, hw2=known.shape)
         yield pairs.cpu().numpy()
@@ -108,7 +108,7 @@ def hard_matches(
                 "oris": tensor(np.deg2rad(one.angle_deg))[None],
                 "image_size": tensor(np.array(one.shape[::-1], float))[None],
             }
-            for one, vectors in zip(both, described, strict=True)
+            for one, vectors in zip(features, described, strict=True)
         ]
         found = matcher({"image0": images[0], "image1": images[1]})
         yield found["matches"][0].cpu().numpy()

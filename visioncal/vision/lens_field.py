@@ -160,8 +160,8 @@ class Coefficients:
             poses: (v, 6, 6) information on the poses.
         """
         root = np.linalg.cholesky(information + np.eye(len(information)))
-        both = np.column_stack([between, gradient, np.eye(len(root))])
-        solved = np.linalg.solve(root.T, np.linalg.solve(root, both))
+        right_sides = np.column_stack([between, gradient, np.eye(len(root))])
+        solved = np.linalg.solve(root.T, np.linalg.solve(root, right_sides))
         inverse = solved[:, between.shape[1] + 1 :]
         inverse_root = np.linalg.inv(root).T
         pose_changes = by_coefficients @ inverse_root

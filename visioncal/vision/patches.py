@@ -50,7 +50,7 @@ def places_of(
     reach_m = half_m + 30 * pixel_m / float(level.camera.matrix[:2].mean())
     rows: list[tuple[int, FloatArray, float, float]] = []
     for number, place in enumerate(points_m[:, :2, None, None].astype(np.float32)):
-        # Of every eighth pixel, those that are near tell where to look.
+        # Every eighth pixel near the patch bounds the search.
         rough = np.argwhere((np.abs(at[:, ::8, ::8] - place) < reach_m).all(axis=0))
         if not len(rough):
             continue
@@ -60,16 +60,16 @@ def places_of(
         taken = inside[free[inside] > 0.3]
         if len(taken) < max(_FEWEST, _FREE * len(inside)):
             continue
-        own, weights = columns[:, taken], free[taken].astype(float)
-        normal = (own * weights) @ own.T
+        patch_columns, weights = columns[:, taken], free[taken].astype(float)
+        normal = (patch_columns * weights) @ patch_columns.T
         inverse = np.linalg.inv(normal + 1e-9 * (np.trace(normal) + 1e-9) * np.eye(4))
         if np.linalg.cond(inverse[:2, :2]) > _LONGEST**2:
             continue
-        solved = inverse @ (own * weights) @ residuals[taken]
-        rest = residuals[taken] - solved @ own
+        solved = inverse @ (patch_columns * weights) @ residuals[taken]
+        rest = residuals[taken] - solved @ patch_columns
         variance = float(weights @ rest**2) / (float(weights.sum()) - 4)
         _, block = np.unique(blocks[taken], return_inverse=True)
-        scores = np.stack([np.bincount(block, row) for row in own * weights * rest])
+        scores = np.stack([np.bincount(block, row) for row in patch_columns * weights * rest])
         ratio = float(np.sum((inverse @ scores)[:2] ** 2) / (variance * np.trace(inverse[:2, :2])))
         rows.append((number, solved[:2], variance * np.trace(inverse[:2, :2]) / 2, ratio))
     if len(rows) < 2:

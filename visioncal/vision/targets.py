@@ -119,19 +119,19 @@ def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
     dictionary.
     """
     found: dict[str, Any] = {"kind": "charuco"}
-    for own, pattern in _IN_SETTINGS.items():
+    for field, pattern in _IN_SETTINGS.items():
         keys = [key for key in stated if re.fullmatch(pattern, str(key), re.IGNORECASE)]
-        keys = keys or [key for key in stated if str(key).lower() == _BY_SIZE.get(own)]
+        keys = keys or [key for key in stated if str(key).lower() == _BY_SIZE.get(field)]
         numbers = [key for key in keys if type(stated[key]) in (int, float)]
-        keys = numbers if own.endswith("_m") else keys
+        keys = numbers if field.endswith("_m") else keys
         if len(keys) == 1:
             value = stated[keys[0]]
-            if own.endswith("_m"):
+            if field.endswith("_m"):
                 value = value if value < 1.0 else value / 1e3
-            if own == "dictionary" and isinstance(value, int):
+            if field == "dictionary" and isinstance(value, int):
                 value = dictionary_numbered(value)
-            if own not in ("columns", "rows") or (type(value) is int and value < _MOST_COUNTED):
-                found[own] = value
+            if field not in ("columns", "rows") or (type(value) is int and value < _MOST_COUNTED):
+                found[field] = value
     if len(found) > len(_IN_SETTINGS):
         return found
     lists = [value for key, value in stated.items() if _COUNTS.fullmatch(str(key))]
@@ -179,7 +179,7 @@ def _of_kalibr(path: Path) -> dict[str, Any]:
         if table.number("rowSpacingMeters") != table.number("colSpacingMeters"):
             row, needed = table.number("rowSpacingMeters"), "as much as colSpacingMeters"
             raise table.refuse("rowSpacingMeters", row, needed)
-    return {"kind": kind, **{own: table.content.get(key) for own, key in keys.items()}}
+    return {"kind": kind, **{field: table.content.get(key) for field, key in keys.items()}}
 
 
 def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:

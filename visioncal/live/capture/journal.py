@@ -198,9 +198,9 @@ def posed(view: View, pose: View | ArmState) -> View:
         )
     )
 
-    def paired(own: Mapping[str, _Cell], other: Mapping[str, _Cell]) -> dict[str, _Cell]:
-        kept = {name: cell for name, cell in own.items() if _OF_PICTURE.fullmatch(name)}
-        return kept | {k: cell for k, cell in other.items() if not _OF_PICTURE.fullmatch(k)}
+    def paired(picture_row: Mapping[str, _Cell], arm_row: Mapping[str, _Cell]) -> dict[str, _Cell]:
+        kept = {name: cell for name, cell in picture_row.items() if _OF_PICTURE.fullmatch(name)}
+        return kept | {k: cell for k, cell in arm_row.items() if not _OF_PICTURE.fullmatch(k)}
 
     return replace(view, numbers=paired(view.numbers, numbers), text=paired(view.text, text))
 
@@ -394,11 +394,13 @@ class Journal:
             views = [*self.views]
             for row, view in enumerate(views):
                 if view.image.endswith(_AGAIN):
-                    own = {path: f"{path.removesuffix(_AGAIN)}.png" for path in view.files}
-                    for before, name in own.items():
+                    final_names = {path: f"{path.removesuffix(_AGAIN)}.png" for path in view.files}
+                    for before, name in final_names.items():
                         self._write(name, read_bytes(self.folder / before))
-                    depth = {"depth": own[view.depth]} if view.depth else {}
-                    views[row] = replace(view, image=own[view.image], text={**view.text, **depth})
+                    depth = {"depth": final_names[view.depth]} if view.depth else {}
+                    views[row] = replace(
+                        view, image=final_names[view.image], text={**view.text, **depth}
+                    )
             self._write(_TABLE, write_csv(self._columns, views))
             self.views = tuple(views)
         for path in self.folder.glob(f"*/*{_AGAIN}"):

@@ -261,14 +261,14 @@ def motion_summary(
         DriverError: The arm does not report its joints, or is stopped.
         DataError: The plan is for another arm, or no safe path to the first stop was found.
     """
-    here = cell.joints()
-    check_same_arm(cell, plan.cell.robot, here)
+    start = cell.joints()
+    check_same_arm(cell, plan.cell.robot, start)
     stops = tuple(stop for stop in plan.stops if stop.view not in done)
     if not stops:
         return MotionSummary(())
-    first = checked_path(plan, stops[0], here)
-    postures = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
-    turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
+    first = checked_path(plan, stops[0], start)
+    postures = [start, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
+    turns = np.abs(np.diff(np.array([start, *first]), axis=0)).sum(axis=0)
     # A stop takes 1.5 s besides the motion to it.
     duration_s = sum(travel_s(options, *ends) for ends in pairwise(postures)) + 1.5 * len(stops)
     return MotionSummary(stops, first, float(turns.max()), duration_s)
@@ -348,22 +348,22 @@ class RestWatch:
 
     def begins(self, state: ArmState) -> bool:
         """Whether by its newest state the arm has come to rest at a new pose."""
-        still, here = self._still, state.base_from_flange
+        still, flange_pose = self._still, state.base_from_flange
         if self._first is None or why_arm_moves(self._first, state, still):
             self._first = state
-        if self._tried is not None and _is_elsewhere(self._tried, here):
+        if self._tried is not None and _is_elsewhere(self._tried, flange_pose):
             self._tried = None
         if state.stamp_s - self._first.stamp_s < still.quiet_s or self._tried is not None:
             return False
         taken = [pose for view in self._journal.views if (pose := state_of(view)) is not None]
-        if not all(_is_elsewhere(pose.base_from_flange, here) for pose in taken):
+        if not all(_is_elsewhere(pose.base_from_flange, flange_pose) for pose in taken):
             return False
-        self._first, self._tried = None, here
+        self._first, self._tried = None, flange_pose
         return True
 
 
-def _is_elsewhere(pose: FloatArray, here: FloatArray) -> bool:
-    mm, deg = pose_difference(pose, here)
+def _is_elsewhere(pose: FloatArray, other: FloatArray) -> bool:
+    mm, deg = pose_difference(pose, other)
     return mm >= 20.0 or deg >= 5.0
 
 

@@ -51,12 +51,12 @@ class _StillFrame:
     @classmethod
     def of(cls, cell: LiveCell) -> "_StillFrame":
         """Takes a frame."""
-        asked, before = cell.clock.now(), cell.state()
+        request_s, before = cell.clock.now(), cell.state()
         frame, after = cell.camera.frame(), cell.state()
-        if frame.stamp_s < asked - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
+        if frame.stamp_s < request_s - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
             raise DriverError(
-                f"{cell.camera.name}: its picture is of {frame.stamp_s - asked:+.3f} s from the "
-                "request, but must be exposed after it.",
+                f"{cell.camera.name}: its picture is of {frame.stamp_s - request_s:+.3f} s from "
+                "the request, but must be exposed after it.",
                 culprits=[cell.camera.name],
                 next_step="The camera hands out old pictures, or its clock is not the host's.",
             )
@@ -197,8 +197,8 @@ def pictured_views(
     assert isinstance(camera, StoredPictures)
     names = camera.waiting()
     if len(names) < len(states):
-        asked, there = counted(len(states), "pose"), counted(len(names), "picture")
-        return f"{asked}, and {there} without one: save the pictures first, and press again."
+        poses, pictures = counted(len(states), "pose"), counted(len(names), "picture")
+        return f"{poses}, and {pictures} without one: save the pictures first, and press again."
     if due != names[0]:
         return f"The picture due is {names[0]} now: look at it, and press again."
     for (number, state), name in zip(states.items(), names, strict=False):

@@ -98,8 +98,8 @@ class Features:
             next(arrivals, None)
         for name in automatic:
             self._why_not("Off", name)
-        asked = {"exposure_us": _EXPOSURE, "gain": _GAIN, "pixel_format": ("PixelFormat",)}
-        values = {name: self.get(*features) for name, features in asked.items()}
+        settings = {"exposure_us": _EXPOSURE, "gain": _GAIN, "pixel_format": ("PixelFormat",)}
+        values = {name: self.get(*features) for name, features in settings.items()}
         return {name: value for name, value in values.items() if value is not None}
 
 

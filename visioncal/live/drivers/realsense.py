@@ -112,16 +112,16 @@ def _arrivals(
         return np.array(frame.as_video_frame().get_data(), dtype=np.uint8)
 
     def distances() -> Image16:
-        aligned = both if is_same else align.process(both)
+        aligned = frame_pair if is_same else align.process(frame_pair)
         return np.array(aligned.get_depth_frame().get_data(), dtype=np.uint16)
 
     while device.is_connected():
         if not others:
             came, frame = queue.try_wait_for_frame(100)
         else:
-            came, both = queue.try_wait_for_frames(100)
-            frame = came and both.get_color_frame()
-            came = bool(frame and both.get_depth_frame())
+            came, frame_pair = queue.try_wait_for_frames(100)
+            frame = came and frame_pair.get_color_frame()
+            came = bool(frame and frame_pair.get_depth_frame())
         now_s, exposed_s = time.monotonic(), None
         is_global = came and frame.get_frame_timestamp_domain() == rs.timestamp_domain.global_time
         if is_global and all(frame.supports_frame_metadata(moment) for moment in moments):

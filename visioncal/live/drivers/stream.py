@@ -215,7 +215,7 @@ def chosen(kind: str, found: Sequence[tuple[str, ...]], wanted: str, viewer: str
     """Index of the one camera that is meant among those that are connected, by their names.
 
     Raises:
-        DriverError: There is none, or several and none of them is named.
+        DriverError: No camera is connected, or several are and none is named.
     """
     matching = [index for index, names in enumerate(found) if not wanted or wanted in names]
     if len(matching) == 1:
@@ -224,9 +224,9 @@ def chosen(kind: str, found: Sequence[tuple[str, ...]], wanted: str, viewer: str
     why = "is not connected"
     if matching:
         why, step = "may be any of several", f"Say which: --camera {kind}:{found[matching[0]][0]}."
-    there = ", ".join(" ".join(names) for names in found) or "none"
+    connected = ", ".join(" ".join(names) for names in found) or "none"
     name = f"{kind}:{wanted}".rstrip(":")
-    raise camera_error(f"camera {name}", f"{why}; connected: {there}", step)
+    raise camera_error(f"camera {name}", f"{why}; connected: {connected}", step)
 
 
 def refuse_settings(name: str, requested: DeviceSetup, where: str) -> None:

@@ -132,24 +132,27 @@ class Admission:
             self._invite(query)
         return query
 
-    def _refused(self, asked: HTTPConnection) -> Response | None:
+    def _refused(self, request: HTTPConnection) -> Response | None:
         """The answer to a request that is not for the page; None for one that is."""
-        by, is_socket = asked.headers, asked.scope["type"] == "websocket"
+        by, is_socket = request.headers, request.scope["type"] == "websocket"
         host, *others = by.getlist("host") or [""]
         match = _HOST.fullmatch(host.lower())
         is_half = not is_socket and "websocket" in by.get("upgrade", "").lower()
         if match is None or others or is_half:
             return Response("The request is broken.", 400)
         is_known = match[1].rstrip(".") in self._hosts or (self._invite and address_of(match[1]))
-        own = f"http://{host}"
-        is_own = by.get("origin", "" if is_socket else own) in (own, f"https://{host}")
+        page_origin = f"http://{host}"
+        is_own = by.get("origin", "" if is_socket else page_origin) in (
+            page_origin,
+            f"https://{host}",
+        )
         fetched = by.get("sec-fetch-site"), by.get("sec-fetch-mode") == "navigate"
         if not is_known or not is_own or fetched == ("cross-site", False):
             return Response("Not from here.", 403)
-        if not self._invite or _same(asked.cookies.get(self._name, ""), self._cookie):
+        if not self._invite or _same(request.cookies.get(self._name, ""), self._cookie):
             return None
-        query = asked.scope["query_string"].decode("latin-1")
-        if asked.scope.get("method") != "GET" or not _same(query, self.query):
+        query = request.scope["query_string"].decode("latin-1")
+        if request.scope.get("method") != "GET" or not _same(query, self.query):
             return Response("Open the address that the terminal shows; it is good once.", 403)
         self.query = self._invited()
         welcome = HTMLResponse(_WELCOME, headers={"Cache-Control": "no-store"})

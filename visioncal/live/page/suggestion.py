@@ -96,10 +96,10 @@ def _near(flanges: FloatArray, taken: FloatArray) -> Mask:
     user knows.
     """
     apart = (distances(flanges, pose) for pose in taken)
-    beside = [(shifts_m < _NEAR_M) & (angles < _NEAR_RAD) for shifts_m, angles in apart]
+    near_masks = [(shifts_m < _NEAR_M) & (angles < _NEAR_RAD) for shifts_m, angles in apart]
     out, low = np.linalg.norm(taken[:, :3, 3], axis=1).max(), taken[:, 2, 3].min()
     is_inside = (np.linalg.norm(flanges[:, :3, 3], axis=1) <= out) & (flanges[:, 2, 3] >= low)
-    return np.asarray(np.any(beside, axis=0) & is_inside)
+    return np.asarray(np.any(near_masks, axis=0) & is_inside)
 
 
 def suggested_pose(

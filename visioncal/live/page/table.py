@@ -97,10 +97,10 @@ class ViewTable:
 
     def show(self, now: Snapshot) -> None:
         """Draws what has changed in the rows."""
-        there = {row.number: row for row in now.views}
-        for number in self._rows.keys() - there.keys():
+        current_rows = {row.number: row for row in now.views}
+        for number in self._rows.keys() - current_rows.keys():
             self._rows.pop(number).line.delete()
-        for number, row in there.items():
+        for number, row in current_rows.items():
             if number not in self._rows:
                 with self._all:
                     self._rows[number] = _Line(row, self._open)

@@ -292,22 +292,22 @@ def spawn(options: ControllerOptions | None = None) -> SimulatedController:
     """Starts a simulated controller at a loopback address of its own.
 
     Raises:
-        DriverError: It does not start, for example because a port is taken.
+        DriverError: The controller does not start, for example because a port is taken.
     """
     host = free_host()
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    arguments = (options or ControllerOptions(), host, there)
+    parent_end, child_end = context.Pipe()
+    arguments = (options or ControllerOptions(), host, child_end)
     process = context.Process(target=_serve, args=arguments, daemon=True)
     with safe_path():
         process.start()
-    # This end alone must hold the pipe open, so that the end of either process is noticed.
-    there.close()
-    controller = SimulatedController(host, process, here)
+    # The parent's end alone must hold the pipe open, so that the end of either process is noticed.
+    child_end.close()
+    controller = SimulatedController(host, process, parent_end)
     reason: object = f"it did not start within {_START_S:.0f} s"
-    if here.poll(_START_S):
+    if parent_end.poll(_START_S):
         try:
-            reason = here.recv()
+            reason = parent_end.recv()
         except EOFError:
             reason = "it ended"
         if reason is None:

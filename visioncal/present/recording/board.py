@@ -31,9 +31,9 @@ def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
 
 def picture(target: Target) -> Image:
     """The printed pattern as a grey image, x to the right and y down."""
-    own = kind_of(target).picture(target)
-    if own is not None:
-        return own
+    kind_image = kind_of(target).picture(target)
+    if kind_image is not None:
+        return kind_image
     low, high = extent_m(target)
     side_px = 2000 * target.square_m / float(np.max(high - low))
     # Shows the markers' bits; a large board's pattern is smaller.

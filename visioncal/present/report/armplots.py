@@ -15,12 +15,12 @@ from visioncal.present.report.plotting import (
     LINE,
     MIDDLE_IN,
     WIDE_IN,
-    beside,
     colour_bar,
     drawn,
     legend,
     logarithmic,
     panels,
+    right_label,
     scattered,
 )
 from visioncal.results.arm import ArmResult, ThermalResult
@@ -51,7 +51,7 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
         # Above and below, so that similar values do not overlap.
         rms = np.sqrt(np.mean(pairs**2, axis=0)).tolist()
         for value, colour, rise in zip(rms, (_BEFORE, _AFTER), ("bottom", "top"), strict=True):
-            beside(axes, value, f"rms {significant(value)}", colour, rise)
+            right_label(axes, value, f"rms {significant(value)}", colour, rise)
     step = max(1, -(-len(views) // 25))
     grid[-1, 0].set_xticks(positions[::step], [str(view.view) for view in views][::step])
     grid[-1, 0].set_xlabel("view")

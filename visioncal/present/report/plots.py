@@ -223,8 +223,10 @@ def depth_cells(
 ) -> FloatArray | None:
     """(n, 5) the cells of depth of a camera in all views; None without any."""
     seer = frame_name("camera", camera)
-    mine = {view.view for view in calibration.views if not camera or view.seer == seer}
-    parts = [view.depth for view in evidence if view.depth is not None and view.view in mine]
+    camera_views = {view.view for view in calibration.views if not camera or view.seer == seer}
+    parts = [
+        view.depth for view in evidence if view.depth is not None and view.view in camera_views
+    ]
     return np.concatenate(parts) if parts else None
 
 

@@ -135,7 +135,7 @@ def legend(figure: Figure, entries: Sequence[tuple[str, str, str]]) -> None:
                   columnspacing=1.2, borderaxespad=0.0)  # fmt: skip
 
 
-def beside(axes: Axes, y: float, words: str, colour: str = INK, rise: str = "center") -> None:
+def right_label(axes: Axes, y: float, words: str, colour: str = INK, rise: str = "center") -> None:
     """Writes words to the right of the axes, at a value."""
     axes.annotate(words, (1.0, y), xytext=(5.0, 0.0), xycoords=("axes fraction", "data"),
                   textcoords="offset points", fontsize=SMALL, color=colour, va=rise,

@@ -162,11 +162,11 @@ def columns_to_send(
 
 def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: IntArray) -> str:
     """Formats rows, by index, as CSV with all their columns, corrected values in place."""
-    own = targets.table.columns
-    names = [*own, *(column for column in columns if column not in own)]
+    table_columns = targets.table.columns
+    names = [*table_columns, *(column for column in columns if column not in table_columns)]
     lines = [names]
     for row in rows:
-        cells = dict(zip(own, targets.table.rows[row], strict=True))
+        cells = dict(zip(table_columns, targets.table.rows[row], strict=True))
         cells |= {name: written(name, float(numbers[row])) for name, numbers in columns.items()}
         lines.append([cells[name] for name in names])
     return csv_text(lines, inert=True)

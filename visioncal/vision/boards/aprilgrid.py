@@ -87,16 +87,19 @@ class AprilGrid(GridBoard, Board):
                 "is seen"
             )
         numbers = ids - target.marker_id
-        own = (numbers >= 0) & (numbers < target.columns * target.rows)
-        if own.sum() <= 0.5 * len(own):
-            return foreign(ids[~own].tolist())
-        px, misfit = self._ordered(target, numbers, px, own)
+        is_on_grid = (numbers >= 0) & (numbers < target.columns * target.rows)
+        if is_on_grid.sum() <= 0.5 * len(is_on_grid):
+            return foreign(ids[~is_on_grid].tolist())
+        px, misfit = self._ordered(target, numbers, px, is_on_grid)
         if misfit > LAYOUT_MISFIT:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
         size = f"the target's {target.columns} x {target.rows}"
-        if not own.all() and layout_misfit(self.tag_corners(target, numbers), px) <= LAYOUT_MISFIT:
-            return NotFound(f"the grid has tag {ids[~own][0]} besides {size}", misfit=True)
-        numbers, px = numbers[own], px[own]
+        if (
+            not is_on_grid.all()
+            and layout_misfit(self.tag_corners(target, numbers), px) <= LAYOUT_MISFIT
+        ):
+            return NotFound(f"the grid has tag {ids[~is_on_grid][0]} besides {size}", misfit=True)
+        numbers, px = numbers[is_on_grid], px[is_on_grid]
         refined = _refined_tags(image, px, target.spacing)
         if why := self.other_spacing(target, self.page_places(target, numbers), refined, image):
             return NotFound(why, misfit=True)
@@ -109,15 +112,15 @@ class AprilGrid(GridBoard, Board):
         return DetectedCorners(ids, refined.reshape(-1, 2))
 
     def _ordered(
-        self, target: Target, numbers: IntArray, px: FloatArray, own: Mask
+        self, target: Target, numbers: IntArray, px: FloatArray, is_on_grid: Mask
     ) -> tuple[FloatArray, float]:
         """Orders the corners (t, 4, 2) of tags as on the page, and measures the layout's misfit."""
         # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
         rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
-        if own.sum() < 2:
+        if is_on_grid.sum() < 2:
             return rotated[0], 0.0
-        places = self.tag_corners(target, numbers[own])
-        misfits = [layout_misfit(places, array[own]) for array in rotated]
+        places = self.tag_corners(target, numbers[is_on_grid])
+        misfits = [layout_misfit(places, array[is_on_grid]) for array in rotated]
         return rotated[int(np.argmin(misfits))], min(misfits)
 
 

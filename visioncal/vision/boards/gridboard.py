@@ -154,11 +154,13 @@ class GridBoard(BoardKind):
         numbers = np.arange(target.columns * target.rows)
         ids = numbers + target.marker_id
         seen = once(*read_markers(image, target.dictionary, target.border))
-        own = {number: px for number, px in seen.items() if number in ids}
-        if 2 * len(own) < len(seen):
-            return foreign([number for number in seen if number not in own])
-        places = self.page_places(target, np.array([*own], dtype=np.int64) - target.marker_id)
-        px = np.reshape([*own.values()], (-1, 4, 2))
+        board_markers = {number: px for number, px in seen.items() if number in ids}
+        if 2 * len(board_markers) < len(seen):
+            return foreign([number for number in seen if number not in board_markers])
+        places = self.page_places(
+            target, np.array([*board_markers], dtype=np.int64) - target.marker_id
+        )
+        px = np.reshape([*board_markers.values()], (-1, 4, 2))
         if why := self.other_spacing(target, places, px, image):
             return NotFound(why, misfit=True)
         corner_ids = dict(zip(ids.tolist(), 4 * numbers[:, None] + np.arange(4), strict=True))

@@ -214,8 +214,8 @@ def poor_image_reason(image: Image, max_blur_px: float) -> str:
         if len(steep) > fewest:
             by_sector[at] = np.partition(steep, -fewest)[-fewest]
     # A board has edges in two directions; motion leaves those sharp that are along it.
-    both = np.minimum(by_sector, np.roll(by_sector, 8))
-    smear = float(_sigma_of(both.max()))
+    weaker_slopes = np.minimum(by_sector, np.roll(by_sector, 8))
+    smear = float(_sigma_of(weaker_slopes.max()))
     for words, wide_px in (
         ("the image is blurred, its sharpest edges are", blur),
         ("the image is blurred along one direction, as by motion: edges across it are", smear),

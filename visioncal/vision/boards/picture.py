@@ -140,13 +140,13 @@ class Picture(BoardKind):
 
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Places of its patches in a (h, w) grey image, or why it is not found."""
-        asked = cast("PictureTarget", target)
-        picture = _known(asked)
+        picture_target = cast("PictureTarget", target)
+        picture = _known(picture_target)
         if picture.unfit:
             return NotFound(f"the picture {picture.unfit}")
         reason = ""
         for longest_px in _SEARCHED_PX:
-            start = picture.matched(image, asked.weights_in, longest_px)
+            start = picture.matched(image, picture_target.weights_in, longest_px)
             found = start if isinstance(start, str) else self._registered(image, target, start)
             if isinstance(found, DetectedCorners):
                 return found

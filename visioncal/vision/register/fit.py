@@ -88,12 +88,14 @@ class Look:
         """
         light, shares = self.drawn.light, self.drawn.shares
         (count, known), shape = shares.shape[:2], shares.shape[2:]
-        own = np.stack([*self.drawn.slopes, light, np.ones_like(light), light**2, self.residuals])
+        layers = np.stack(
+            [*self.drawn.slopes, light, np.ones_like(light), light**2, self.residuals]
+        )
         sums = np.zeros((*shape, count + 3, count + 4), np.float32)
         # Row by row, as more pixels do not fit into a cache.
         for row, total in enumerate(sums):
             rows = slice(BLOCK_PX * row, BLOCK_PX * (row + 1))
-            part = own[:, rows].copy()
+            part = layers[:, rows].copy()
             part[:count] *= self.gain[rows]
             pair = [
                 one.reshape(-1, BLOCK_PX, shape[1], BLOCK_PX).transpose(2, 0, 1, 3)
@@ -224,8 +226,8 @@ class Fitter:
         layers += [layers[2] * light, layers[2] * light**2, layers[3] * light, layers[2] * image]
         down, along = ((side[:, None] * side).reshape(9, -1) for side in level.nodes)
         sums = (down @ (np.stack(layers) @ along.T)).astype(float).reshape(-1, 3, 3, 3, 3)
-        both = sums.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
-        zeroth, one, two, imaged, three, four, imaged_one, imaged_two = both
+        moments = sums.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
+        zeroth, one, two, imaged, three, four, imaged_one, imaged_two = moments
         # Nodes' weights sum to 1.
         square = three.sum(axis=1), two.sum(axis=1)
         normal = np.block([

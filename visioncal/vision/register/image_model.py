@@ -248,10 +248,11 @@ class Level:
         count = 1 + 2 * moving * int(
             np.clip(moved_px(self.camera, flat, seen) / self.factor / 3, 2, 6)
         )
-        lens, both = _pixels(seen.lens), (self.table, self.middles)
-        bends = [one[2:].reshape(len(lens), 2, *one.shape[1:]) for one in both]
+        lens, ray_tables = _pixels(seen.lens), (self.table, self.middles)
+        bends = [one[2:].reshape(len(lens), 2, *one.shape[1:]) for one in ray_tables]
         at_nodes, rays = (
-            one[:2] + np.tensordot(lens, bend, 1) for one, bend in zip(both, bends, strict=True)
+            one[:2] + np.tensordot(lens, bend, 1)
+            for one, bend in zip(ray_tables, bends, strict=True)
         )
         x, y = self.splines[0] @ at_nodes @ self.splines[1].T
         n, along = _pixels(pose[:3, 2]), _pixels(pose[:3, :2])
@@ -275,15 +276,15 @@ class Level:
         corner = _pixels(flat.corner_m)[:, None, None]
         for k in range(count):
             at = (k + 0.5) / count - 0.5
-            own = _exp(at * seen.twist) @ pose
+            moved_pose = _exp(at * seen.twist) @ pose
             # From rays to the plane of the print.
-            rows = _pixels(np.linalg.inv(np.c_[own[:3, :2], own[:3, 3]]))
+            rows = _pixels(np.linalg.inv(np.c_[moved_pose[:3, :2], moved_pose[:3, 3]]))
             gx, gy, scale = (row[0] * x + row[1] * y + row[2] for row in rows)
             on = np.stack([gx / scale, gy / scale])
             texels = _pixels(((on - corner) / np.float32(flat.texel_m) - 0.5 - by // 2) / by)
-            beside = [np.float32(within) * np.gradient(texels, axis=axis) for axis in (2, 1)]
+            offsets = [np.float32(within) * np.gradient(texels, axis=axis) for axis in (2, 1)]
             for right, down in ((0, 0),) if not within else ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-                at_px = texels + right * beside[0] + down * beside[1]
+                at_px = texels + right * offsets[0] + down * offsets[1]
                 drawn, bent = (
                     cv2.remap(table, at_px[0], at_px[1], cv2.INTER_LINEAR, None, _EDGE)
                     for table in (first, second)
@@ -378,10 +379,11 @@ def _gauss(layer: Pixels, variance: float) -> Pixels:
 
 
 def _gauss_by_variance(layer: Pixels, variance: float) -> Pixels:
-    """The derivative of the same by the variance."""
-    both = _kernels(variance)
+    """The derivative of a layer's Gaussian blur by the variance."""
+    kernels = _kernels(variance)
     parts = (
-        cv2.sepFilter2D(layer, -1, one, two, borderType=_EDGE) for one, two in (both, both[::-1])
+        cv2.sepFilter2D(layer, -1, one, two, borderType=_EDGE)
+        for one, two in (kernels, kernels[::-1])
     )
     return _pixels(sum(parts))
 
