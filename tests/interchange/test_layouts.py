@@ -1608,6 +1608,19 @@ def test_alternating_rows_of_both_sides_are_read_without_names(tmp_path, has_mat
     twice.refused("18 poses of the robot, but neither images nor poses of the target")
 
 
+@pytest.mark.parametrize("is_quaternion_first", [False, True])
+def test_rows_of_a_slow_motion_are_no_sides_in_turn(tmp_path, is_quaternion_first):
+    """Poses of a camera that a hand leads: neighbours turn nearly alike."""
+    angles = np.linspace(0.0, 1.0, 18)[:, None] * [0.5, 0.3, -0.7]
+    turned = Rotation.from_rotvec(angles).as_quat()
+    places = 0.1 * angles + [0.4, -0.2, 0.9]
+    rows = np.hstack(
+        [np.roll(turned, 1, axis=1), places] if is_quaternion_first else [places, turned]
+    )
+    np.savetxt(tmp_path / "in.txt", rows, fmt="%.6f")
+    assert [len(each) for each in reading.read_rows(tmp_path / "in.txt")] == [18]
+
+
 def test_angles_of_two_runs_are_no_sides(tmp_path):
     """By the files' name they are joints, or by their numbers those of one motion."""
     (tmp_path / "in").mkdir()

@@ -134,7 +134,10 @@ _TURN_ALIKE = 0.05
 
 
 def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
-    """Whether even and odd rows are poses that turn by the same angles, and no copies."""
+    """Whether even and odd rows are poses that turn by the same angles, and no copies.
+
+    In a slow motion of one side, a row turns as much like the next one as like its own.
+    """
     if not all(is_number(cell) for row in rows for cell in row):
         return False
     numbers = np.array(rows, dtype=float)
@@ -146,7 +149,8 @@ def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
     # Cosines of half the angle between two quaternions, of either sign, or traces.
     first, second = (np.abs(own @ own.T) if is_short else own @ own.T for own in (even, odd))
     copied, apart = np.median(np.abs(even - odd)), np.median(np.abs(first - second))
-    return bool(apart < _TURN_ALIKE * np.ptp(first) <= copied)
+    later = np.median(np.abs(first[1:, 1:] - second[:-1, :-1]))
+    return bool(apart < _TURN_ALIKE * np.ptp(first) <= copied and 2.0 * apart < later)
 
 
 # Names of numbers in a mapping that are one array.
