@@ -731,6 +731,11 @@ def test_poses_of_the_camera_in_place_of_the_robots_are_named(mount: str) -> Non
     verdict = calibrate(pairs_session(mount, poses, cell.cam_from_target)).verdict
     assert (verdict.status, ids(verdict)[:1]) == ("check", ["camera_poses"])
     assert "with the poses that the robot reported" in verdict.next_steps[0].words
+    # Images show that nothing but the camera was there.
+    session = session_of(cell, poses)
+    assert [finding.kind for finding in doctor(session).findings] == ["camera_poses"]
+    verdict = calibrate(session).verdict
+    assert (verdict.status, ids(verdict)[:1]) == ("bad", ["camera_poses"])
 
 
 def test_a_camera_behind_its_flange_where_no_bracket_has_it_is_a_doubt() -> None:

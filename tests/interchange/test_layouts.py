@@ -1621,6 +1621,24 @@ def test_rows_of_a_slow_motion_are_no_sides_in_turn(tmp_path, is_quaternion_firs
     assert [len(each) for each in reading.read_rows(tmp_path / "in.txt")] == [18]
 
 
+def test_poses_of_the_board_are_not_taken_for_the_robot_s(tmp_path):
+    """As many as the pictures, beside the robot's of two stops more; alone they are refused."""
+    poses, pictures, session = world()
+    seen = np.array([view.cam_from_target().as_matrix() for view in session.views])
+    (tmp_path / "in/images").mkdir(parents=True)
+    for at, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / f"in/images/image_{at + 1}.png"), picture)
+    np.save(tmp_path / "in/board2camera.npy", seen)
+    said = ("--target", session.document["target"])
+    alone = visioncal("convert", tmp_path / "in", tmp_path / "out", *said, "--mount", "eye-to-hand")
+    alone.refused("are those of the camera over the board", "--robot-key")
+    np.save(tmp_path / "in/ee2base.npy", [*poses, *poses[[2, 5]]])
+    source, mount = tmp_path / "in", ("--mount", "eye-in-hand")
+    visioncal("convert", source, tmp_path / "out", *said, *mount).good()
+    found = [view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "out").views]
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
 def test_angles_of_two_runs_are_no_sides(tmp_path):
     """By the files' name they are joints, or by their numbers those of one motion."""
     (tmp_path / "in").mkdir()

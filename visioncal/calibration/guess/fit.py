@@ -53,6 +53,15 @@ _OUTLIER_PRIOR = 0.05
 CONCENTRATED = 4
 # Directions with a smaller singular value, relative to the largest, are not determined.
 _DETERMINED = 1e-3
+# Another program's lens shifts a camera by some hundredths of its distance [m], and turns it less
+# than so: no camera is so near a flange, its axes parallel, and a board so flat in a base at once.
+_SAME_M, _PARALLEL = 0.02, np.cos(np.radians(2.0))
+# Poses that are so found.
+CAMERA_OVER_BOARD = (
+    "the robot's poses are those of the camera over the board, or of the board before the camera: "
+    "by them, the camera is in its place and the board in its own, and no robot is anywhere. "
+    "Another program found them in the same images"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +173,16 @@ class Fit:
     def _outlier(self) -> FloatArray:
         """(n,) log densities of outlier views, which no noise changes."""
         return np.asarray(np.log(_OUTLIER_PRIOR) - 3.0 * np.log1p(self._squares).sum(axis=0))
+
+
+def are_of_camera(camera: FloatArray, target: FloatArray) -> bool:
+    """Whether (4, 4) edges are the identity, and the board's own frame but for its first corner.
+
+    The poses of a robot by which they are so are the camera's over the board.
+    """
+    turned = np.abs(target[:3, :3])
+    is_parallel = min(*camera.diagonal()[:3], turned[2, 2], turned[:2, :2].max()) > _PARALLEL
+    return bool(is_parallel and max(np.abs(camera[:3, 3]).max(), abs(target[2, 3])) < _SAME_M)
 
 
 def is_about_one_axis(rotations: FloatArray) -> bool:

@@ -20,6 +20,7 @@ from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, Sensor
 from visioncal.calibration.suspects.limits import few_stops
+from visioncal.calibration.suspects.mirrored_cell import of_camera
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards, with_undone
 from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.rounded_poses import rounded
@@ -124,7 +125,7 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
         read += misreadings(run)
     hint = " ".join(finding.words for finding in read)
     if error is None and not read:
-        read += turned_boards(run)
+        read += [*of_camera(run)] or turned_boards(run)
     if cause is not None:
         yield cause
     yield from read

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from visioncal.calibration.guess.fit import CAMERA_OVER_BOARD, are_of_camera
+from visioncal.calibration.pipeline.guess_inputs import chain_fit
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN
 from visioncal.calibration.suspects.suspect import CHAIN, FACT, SOURCES, Suspect
@@ -18,9 +20,6 @@ from visioncal.vision.targets import corner_positions
 # seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist;
 # farther behind than the last link is long, no bracket has it.
 _NEAR_M, _FAR_M, _BEHIND_M, _FAR_BEHIND_M = 0.3, 0.5, 0.05, 0.08
-# Another program's lens shifts a camera by some hundredths of its distance [m], and turns it less
-# than so: no camera is so near a flange, its axes parallel, and a board so flat in a base at once.
-_SAME_M, _PARALLEL = 0.02, np.cos(np.radians(2.0))
 
 
 def _found(run: RunState) -> Iterator[Finding]:
@@ -31,18 +30,8 @@ def _found(run: RunState) -> Iterator[Finding]:
     if matched is not None and matched.joints_rad:
         return
     edges = [*run.assessment.last_edges.items()][:2]
-    if _is_of_camera(*(edge.matrix for _, edge in edges)):
-        yield Finding(
-            "camera_poses",
-            "The robot's poses are those of the camera over the board, or of the board before the "
-            "camera: by them, the camera is in its place and the board in its own, and no "
-            "robot is anywhere. Another program found them in the same images.",
-            Remedy(
-                "Convert the recording again, with the poses that the robot reported; these say "
-                "nothing of it."
-            ),
-            until_mm=0.0,
-        )
+    if found := _of_camera(run, *(edge.matrix for _, edge in edges)):
+        yield found
         return
     camera, target = (
         (name, float(np.linalg.norm(edge.transform.translation))) for name, edge in edges
@@ -97,11 +86,27 @@ def _middle_m(run: RunState, flange_from_target: FloatArray) -> float:
     return float(np.linalg.norm(apply(flange_from_target, middle)))
 
 
-def _is_of_camera(camera: FloatArray, target: FloatArray) -> bool:
-    """Whether (4, 4) poses are the identity, and the board's own frame but for its first corner."""
-    turned = np.abs(target[:3, :3])
-    is_parallel = min(*camera.diagonal()[:3], turned[2, 2], turned[:2, :2].max()) > _PARALLEL
-    return bool(is_parallel and max(np.abs(camera[:3, 3]).max(), abs(target[2, 3])) < _SAME_M)
+def of_camera(run: RunState) -> Iterator[Finding]:
+    """The finding that the robot's poses are the camera's, before anything is fitted."""
+    fit = chain_fit(run.base_from_flange, run.poses_of_one_board, run.session.mount)
+    if fit is not None and fit.closes and (found := _of_camera(run, fit.x, fit.z)):
+        yield found
+
+
+def _of_camera(run: RunState, camera: FloatArray, target: FloatArray) -> Finding | None:
+    """The finding by both edges; a tracker of no images may be set to the robot's own frames."""
+    if not are_of_camera(camera, target):
+        return None
+    return Finding(
+        "camera_poses",
+        f"{CAMERA_OVER_BOARD[0].upper()}{CAMERA_OVER_BOARD[1:]}.",
+        Remedy(
+            "Convert the recording again, with the poses that the robot reported; these say "
+            "nothing of it."
+        ),
+        is_fatal=bool(run.corners),
+        until_mm=0.0,
+    )
 
 
 # A result by such poses is of nothing else.

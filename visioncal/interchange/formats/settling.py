@@ -11,11 +11,13 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration.guess import (
+    CAMERA_OVER_BOARD,
     CLEAR,
     FEWEST_ROWS,
     NO_READING,
     ONE_AXIS,
     Guess,
+    are_of_camera,
 )
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
@@ -200,12 +202,15 @@ def _tested(
     Raises DataError where several agree alike, are not the same, and no more rows can tell.
     """
     found: list[tuple[float, int, ForeignRecording]] = []
-    why, others = "", list[Guess]()
+    why, others, of_camera = "", list[Guess](), list[ForeignRecording]()
     for rank, item in readings:
         try:
             guess = seen.guess(item)
         except VisioncalError as error:
             why = why or error.message.rstrip(".")
+            continue
+        if seen.run is not None and are_of_camera(guess.best.fit.x, guess.best.fit.z):
+            of_camera.append(item)
             continue
         why = why or guess.sentence.rstrip(".")
         if guess.stands_out or guess.declared.fit.closes:
@@ -219,6 +224,13 @@ def _tested(
             f"{readings[0][1].name}: the camera is not mounted as stated. {others[0].sentence}",
             culprits=["--mount"],
             next_step=f"Give --mount {others[0].best.hypothesis.mount}.",
+        )
+    if of_camera and not found:
+        raise DataError(
+            f"{readings[0][1].name}: {CAMERA_OVER_BOARD}.",
+            culprits=[str(of_camera[0].robot.places[0])],
+            next_step="Name the poses that the robot reported with --robot-key or --robot-columns, "
+            "or their file.",
         )
     if not found:
         return None, why
