@@ -79,6 +79,11 @@ def test_packages_import_only_from_those_before():
             assert not wrong, (path, wrong)
 
 
+def test_files_are_read_in_one_go():
+    sizes = {path.name: len(path.read_text().splitlines()) for path in modules()}
+    assert {name: size for name, size in sizes.items() if size > 500} == {}
+
+
 def test_an_arm_moves_through_the_gate_alone():
     callers = {
         path.relative_to(PACKAGE).as_posix()
