@@ -22,6 +22,7 @@ from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS
+from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.history import History
 from visioncal.robot import load_robot
@@ -70,6 +71,29 @@ def test_an_unchanged_cell_passes_as_often_as_it_should(place):
     # Chi-square of thirty directions; the mean of four is known to 3.9, and the noise's scale to
     # a tenth, which is three more.
     assert np.mean([value.unchanged.misfit for value in found]) == pytest.approx(30.0, abs=15.0)
+
+
+@pytest.mark.parametrize(
+    ("count", "kind", "raises"),
+    [(4, "wrong_views", True), (2, "wrong_views", False), (4, "something_moved", False)],
+)
+def test_views_that_an_erring_arm_put_off_count_in_the_noise_of_a_check(place, count, kind, raises):
+    result = place.calibration
+    strays = tuple(
+        replace(view, used=False, reason="the arm errs so there", residual_mm=0.9, residual_deg=0.1)
+        for view in result.views[:count]
+    )
+    found = Finding(kind, "They were left out.", views=tuple(view.view for view in strays))
+    verdict = replace(result.verdict, findings=(found, *result.verdict.findings))
+    odd = replace(result, views=(*strays, *result.views[count:]), verdict=verdict)
+    before, after = (
+        CalibrationPrior.of(one).noise(from_corners=True).robots[0] for one in (result, odd)
+    )
+    share = count / sum(view.used for view in result.views)
+    wanted = np.sqrt(
+        (1.0 - share) * before**2 + share * np.array([np.deg2rad(0.1), 9e-4]) ** 2 / 3.0
+    )
+    assert after == pytest.approx(wanted if raises else before)
 
 
 def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.estimation.appearance import Appearance, LensBoardParameters
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
-from visioncal.results import Calibration
+from visioncal.results import HELD_BACK, Calibration
 from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import JointFit
 from visioncal.robot.arm_model import ArmModel
@@ -23,6 +24,9 @@ from visioncal.vision.targets import numbered_positions, target_from_document
 
 # Correlation of the arm's errors from which a stop repeats a calibrated one.
 _REPEATED = 0.5
+# Views that were left out without a cause are errors of the arm, which come again, from this number
+# and this share on; fewer are mistakes of rows.
+_FEWEST_STRAYS, _SHARE_OF_STRAYS = 3, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +108,35 @@ class CalibrationPrior:
             stated = dict(zip(names, np.array([rms.deg or 0.0, rms.mm]) / np.sqrt(3), strict=True))
         intervals = {} if uncertainty is None else uncertainty.noise_95
         deg, mm = (max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1]) for name in names)
+        deg, mm = self._with_strays(deg, mm)
         arm = self.calibration.arm
         if arm is not None and arm.level == FUNCTIONS:
             # Functions of the joints have the error of a left-out stop at a new stop.
             mm = max(mm, arm.chosen.held_out_mm / np.sqrt(3))
             deg = max(deg, (arm.chosen.held_out_deg or 0.0) / np.sqrt(3))
         return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
+
+    def _with_strays(self, deg: float, mm: float) -> tuple[float, float]:
+        """Noise per axis with the views that the calibration left out as no more than an arm errs.
+
+        Without them a check of new stops finds a robot that scatters more than it did.
+        """
+        limits, views = CalibrationLimits(), self.calibration.views
+        findings = self.calibration.verdict.findings
+        explained = {view for one in findings if one.kind != "wrong_views" for view in one.views}
+        strays = [
+            (view.residual_deg or 0.0, view.residual_mm)
+            for view in views
+            if not view.used and view.reason != HELD_BACK and view.view not in explained
+            if view.residual_mm is not None and view.residual_mm < limits.scatter_mm[0]
+            if (view.residual_deg or 0.0) < limits.scatter_deg[0]
+        ]
+        count = sum(view.used for view in views) + len(strays)
+        if len(strays) < max(_FEWEST_STRAYS, _SHARE_OF_STRAYS * count):
+            return deg, mm
+        share, squares = 1.0 - len(strays) / count, np.square(strays).sum(axis=0) / (3.0 * count)
+        deg, mm = np.sqrt(share * np.square((deg, mm)) + squares).tolist()
+        return deg, mm
 
     @property
     def freedom(self) -> float:
