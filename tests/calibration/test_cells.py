@@ -275,7 +275,7 @@ def test_robots_of_a_cell_are_read_anew_one_by_one(tmp_path, monkeypatch, three,
 
 @pytest.mark.parametrize(
     ("column", "names", "stops"),
-    [slow("camera", ("left", "right"), (4, 5, 6)), ("target", ("plate_a", "floor"), (3, 7, 9))],
+    [("camera", ("left", "right"), (4, 5, 6)), slow("target", ("plate_a", "floor"), (3, 7, 9))],
 )
 def test_rows_with_the_name_of_another_camera_or_board_are_named(column, names, stops):
     right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=CAMERAS["fine"])

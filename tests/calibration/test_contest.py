@@ -9,6 +9,7 @@ import pytest
 from benchmarks import elsewhere
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated, pairs_session, reporting
+from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.sound_findings import SOUND, changed, directions
@@ -144,7 +145,7 @@ def test_a_camera_that_moved_twice_is_named_with_the_frame_of_either_change():
     ("by", "share", "words"),
     [
         (-1, 0.006, "the image was taken before the arm had arrived, as of commanded poses"),
-        (-1, -0.01, "the pose was read before the arm had arrived"),
+        slow(-1, -0.01, "the pose was read before the arm had arrived"),
         (1, 0.008, "the image was taken once the arm had left"),
     ],
 )
@@ -205,8 +206,9 @@ def test_a_camera_that_slowly_turns_is_no_lens_that_surely_changed(seed):
     flange = cell.robot.base_from_flange @ camera @ exp(twists) @ invert(camera)
     (cause, *_) = calibrated(reporting(cell, base_from_flange=flange)).verdict.causes
     assert cause.by_limit
-    assert "as these views leave it open:" in cause.words
-    assert re.search("what the flange carries crept|The load on the flange crept", cause.words)
+    # The truth may be named alone, where no lens does about as well, and stands beside a lens.
+    truth, beside = "The load on the flange crept", "as these views leave it open: what the flange"
+    assert cause.words.startswith(truth) or f"{beside} carries crept" in cause.words
 
 
 @pytest.mark.slow

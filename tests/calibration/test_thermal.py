@@ -59,11 +59,19 @@ class Warmed:
     whole: Inputs  # What heats the arm, until the end.
 
 
-def warmed(*, temperatures: bool) -> Warmed:
-    """Simulates a warm-up and calibrates with it."""
-    how = WarmUpOptions(CELL, temperatures=temperatures)
-    truth, warming = simulate_warm_up(how), how.warming()
-    session = cell_session(truth, "warm-up", seen="poses")
+@cache
+def recorded(told: str) -> tuple[WarmUpOptions, SimulatedCell, Session]:
+    """A warm-up with temperatures or currents, and its session."""
+    how = WarmUpOptions(CELL, temperatures=told == "temperatures")
+    truth = simulate_warm_up(how)
+    return how, truth, cell_session(truth, "warm-up", seen="poses")
+
+
+@cache
+def learnt(told: str) -> Warmed:
+    """What is calibrated with it."""
+    (how, truth, session), temperatures = recorded(told), told == "temperatures"
+    warming = how.warming()
     whole = session.with_streams({"heat": warming.recorded(temperatures=temperatures)})
     inputs = inputs_of(whole, truth.robot.joints.shape[1])
     return Warmed(truth, how.heats, warming, session, calibrate(session, level="thermal"), inputs)
@@ -95,16 +103,11 @@ def inputs(kind="currents", hours=2.0, seed=0):
     return Inputs(kind, stamps, told, 21.0 + np.sin(stamps / 3000.0))
 
 
-@pytest.fixture(scope="module")
-def learnt():
-    return cache(lambda told: warmed(temperatures=told == "temperatures"))
-
-
 # Over 8 worlds the median share was 0.10 and 0.18, the worst of each 0.14 and 0.34; this world is
 # not the worst. The limits are those that are promised of the median.
 @pytest.mark.slow
 @pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
-def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
+def test_a_hundred_minutes_predict_five_hours(told, limit):
     """All over the workspace, between the training and the fifth hour."""
     found = learnt(told)
     arm, drift = found.truth.robot.true_arm, found.calibration.drift
@@ -127,7 +130,7 @@ def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
     assert 0.4 < np.sqrt(np.mean((left / sigma) ** 2)) < 1.8
 
 
-def test_an_undetermined_coefficient_stays_at_its_prior_and_is_named(learnt):
+def test_an_undetermined_coefficient_stays_at_its_prior_and_is_named():
     thermal = learnt("temperatures").calibration.thermal
     # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
     assert "growth of wrist_3_joint" in thermal.not_determined
@@ -137,7 +140,7 @@ def test_an_undetermined_coefficient_stays_at_its_prior_and_is_named(learnt):
 
 
 @pytest.mark.slow
-def test_uncertainty_of_the_drift_counts_in_the_edges_covariance(learnt):
+def test_uncertainty_of_the_drift_counts_in_the_edges_covariance():
     known, truth = learnt("currents").calibration, learnt("currents").truth.transforms
     away = [log(invert(true) @ known.edges[name].matrix) for name, true in truth.items()]
     error = np.concatenate(away)
@@ -153,7 +156,7 @@ def test_uncertainty_of_the_drift_counts_in_the_edges_covariance(learnt):
     assert (narrower <= np.diag(known.joint_covariance) * (1.0 + 1e-9)).all()
 
 
-def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
+def test_a_check_says_that_it_takes_the_arm_for_cold():
     found = learnt("temperatures")
     cold, warm = found.session.views[:24:4], found.session.views[-6:]
     passed = verify(replace(found.session, views=cold), found.calibration)
@@ -211,7 +214,7 @@ def test_the_compensator_refuses_what_does_not_fit():
     raised(DataError, "does not come after", following.feed, 0.0, currents_a=np.ones(6))
 
 
-def test_the_report_shows_the_drift(learnt):
+def test_the_report_shows_the_drift():
     found = learnt("temperatures")
     page = Page(render(found.calibration, found.session, ()))
     assert "Drift with temperature" in page.text
@@ -219,7 +222,7 @@ def test_the_report_shows_the_drift(learnt):
     assert len(found.calibration.thermal.views) == len(found.session.views)
 
 
-def test_the_calibration_gives_the_arm_at_any_temperature(learnt, tmp_path):
+def test_the_calibration_gives_the_arm_at_any_temperature(tmp_path):
     known = learnt("temperatures").calibration
     known.save(tmp_path / "calibration.json")
     again, warm = Calibration.load(tmp_path / "calibration.json"), known.drift.reference_c + 15.0
@@ -279,8 +282,8 @@ def of_the_first_hour(session):
         slow(of_the_first_hour, r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"),
     ],
 )
-def test_a_session_without_temperatures_is_refused_by_what_it_needs(learnt, change, words):
-    raised(DataError, words, calibrate, change(learnt("temperatures").session), level="thermal")
+def test_a_session_without_temperatures_is_refused_by_what_it_needs(change, words):
+    raised(DataError, words, calibrate, change(recorded("temperatures")[2]), level="thermal")
 
 
 def warming(change=lambda temperatures: temperatures, from_s=0.0):
@@ -327,7 +330,7 @@ def in_milliseconds(session):
 
 
 @pytest.mark.slow
-def test_temperatures_of_another_clock_are_named_before_a_base_that_drifts(learnt):
+def test_temperatures_of_another_clock_are_named_before_a_base_that_drifts():
     sound = learnt("temperatures").calibration.verdict
     assert not any(each.kind == "temperatures" for each in sound.findings)
     result = calibrate(in_milliseconds(learnt("temperatures").session))
@@ -353,7 +356,7 @@ def test_sessions_in_which_nothing_warms_up_are_refused():
     assert calibrate(session).thermal is None
 
 
-def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(learnt, tmp_path):
+def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(tmp_path):
     known, session = learnt("temperatures").calibration, learnt("temperatures").session
     known.save(tmp_path / "calibration.json")
     q = np.array([[0.4, -1.3, 1.5, -1.75, -1.57, 0.3]])

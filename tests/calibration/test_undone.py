@@ -412,7 +412,7 @@ def test_one_flipped_view_of_few_is_named(views, mount):
     assert named[1::2].count(("flipped_poses", (3,))) >= 11
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 @pytest.mark.parametrize("some", [(3, 9, 12), slow((0, 1, 2, 3, 4, 5, 6))])
 def test_flipped_views_of_a_near_marker_are_named(mount, some):
     """Its second pose is degrees off the mirror image, many times the noise of the others."""
@@ -560,7 +560,7 @@ def test_corners_of_smaller_pictures_are_scaled_by_the_printed_command(
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
-@pytest.mark.parametrize("some", [[6], [3, 4, 12, 19]])
+@pytest.mark.parametrize("some", [slow([6]), [3, 4, 12, 19]])
 def test_pictures_that_were_taken_before_are_left_out_by_the_printed_command(
     tmp_path, monkeypatch, some
 ):
@@ -589,6 +589,7 @@ def test_pictures_of_stops_that_are_taken_twice_are_not_taken_before():
     assert found.verdict.causes[0].views == (9,)
 
 
+@pytest.mark.slow
 def test_pictures_of_a_slow_motion_whose_log_is_late_are_not_taken_before():
     """Each is within the noise of the one before, and the last of the late ones 0.2 m away."""
     rng, count, late = np.random.default_rng(0), 400, slice(133, 213)

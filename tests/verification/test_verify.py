@@ -11,7 +11,7 @@ from support.beyond import with_field
 from support.cells import board_numbers, calibrated, known_of, pairs_session, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
-from support.marks import crossed, slow
+from support.marks import crossed, seeds, slow
 from support.misfits import misfit
 from support.pages import Page
 from support.refusals import raised
@@ -460,10 +460,11 @@ def recovered(either, change, rng, causes=None):
     + [slow(kind, mount) for kind in ("camera", "board", "joint 3") for mount in MOUNTS],
     indirect=["either"],
 )
-def test_a_change_is_estimated_with_its_covariance_and_the_rest_is_kept(either, kind):
+@pytest.mark.parametrize("knocks", seeds(1, 3))
+def test_a_change_is_estimated_with_its_covariance_and_the_rest_is_kept(either, kind, knocks):
     rng, old, squares = np.random.default_rng(7), either.calibration, []
     (x, z), q = either.cell.transforms.values(), either.cell.robot.joints
-    for _ in range(3):
+    for _ in knocks:
         change = Change(
             camera=knock(rng, 30.0, 10.0) * ("camera" in kind),
             board=knock(rng, 10.0, 3.0) * ("board" in kind),
