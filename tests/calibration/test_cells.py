@@ -158,7 +158,9 @@ def test_cameras_that_have_each_others_images_from_a_stop_on_are_no_moves():
 
 
 def test_the_joint_covariance_is_in_the_order_of_the_transforms_where_a_frame_moved():
-    found = solved(simulate(replace(PLAIN, moved=(Moved("cam_left", 6),), stops=12, seed=3)))
+    boards = (FLOOR, BoardAt("plate_a", "a"))
+    options = replace(PLAIN, robots=ROBOTS[:1], boards=boards, stops=12, seed=3)
+    found = solved(simulate(replace(options, moved=(Moved("cam_left", 6),))))
     assert [value.frame for value in found.cell.moved] == ["cam_left"]
     for at, edge in enumerate(found.edges.values()):
         block = found.joint_covariance[6 * at :, 6 * at :][:6, :6]

@@ -112,7 +112,8 @@ def test_an_unknown_clock_moves_no_prediction_at_rest():
     assert not jacobians[1].any()
 
 
-@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_a_sweep_by_a_rolling_shutter_is_calibrated(mount):
     how = SweepOptions(stops=8, camera_minus_robot_s=0.037, readout_s=0.0124)
     cell = sweep(CellOptions(seed=1, mount=mount, pixel_sigma_px=0.1), how)

@@ -186,10 +186,9 @@ def photographed(print_, width_m, camera, pose, look=Look(), seed=0, corner_m=(0
         hit = rays @ np.linalg.inv(np.column_stack([pose[:3, :2], pose[:3, 3]])).T
         on = hit[:, :2] / hit[:, 2:]
         for polygon, grey in covers:
-            flat = np.asarray(cv2.perspectiveTransform(on[None], np.eye(3)))[0]
-            inside = _inside(flat, polygon).reshape(picture.shape)
-            texture = grey + 25 * np.sin(on[:, 0] * 900 + on[:, 1] * 400).reshape(picture.shape)
-            picture[inside] = texture[inside]
+            inside = _inside(on, polygon)
+            texture = grey + 25 * np.sin(on[inside, 0] * 900 + on[inside, 1] * 400)
+            picture[inside.reshape(picture.shape)] = texture
     picture = cv2.GaussianBlur(picture, (0, 0), look.gauss_px * s, borderType=cv2.BORDER_REPLICATE)
     if look.disc_px:
         radius = look.disc_px * s
@@ -225,10 +224,14 @@ def _covers(rng, share, size, corner_m):
 
 
 def _inside(points, polygon):
-    sides = np.roll(polygon, -1, axis=0) - polygon
-    off = points[:, None] - polygon[None]
-    cross = sides[:, 0] * off[..., 1] - sides[:, 1] * off[..., 0]
-    return (cross >= 0).all(axis=1) | (cross <= 0).all(axis=1)
+    left, right = np.ones((2, len(points)), dtype=bool)
+    for (x, y), (along_x, along_y) in zip(
+        polygon, np.roll(polygon, -1, axis=0) - polygon, strict=True
+    ):
+        cross = along_x * (points[:, 1] - y) - along_y * (points[:, 0] - x)
+        left &= cross >= 0
+        right &= cross <= 0
+    return left | right
 
 
 def photographed_cell(

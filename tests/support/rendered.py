@@ -129,14 +129,14 @@ def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, n
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     u = (np.arange(width)[:, None] + steps).ravel()
     v = (np.arange(height)[:, None] + steps).ravel()
-    places = lens.straight(np.stack(np.meshgrid(u, v), axis=-1))
-    board = np.concatenate([places, np.ones_like(places[..., :1])], axis=-1) @ np.linalg.inv(flat).T
-    board = board[..., :2] / board[..., 2:]
+    places = lens.straight(np.stack(np.meshgrid(u, v)), axis=0)
+    x, y, z = (row[0] * places[0] + row[1] * places[1] + row[2] for row in np.linalg.inv(flat))
+    x, y = x / z, y / z
     ink = shot.ink_px / shot.square_px
     if target.kind == "circles":
-        picture = _discs(board, target, ink)
+        picture = _discs(x, y, target, ink)
     else:
-        picture = _covered(board[..., 0], board[..., 1], lines, light, ink)
+        picture = _covered(x, y, lines, light, ink)
     picture = _through(picture, shot, rng.uniform(0, np.pi))
     picture = picture.reshape(height, SAMPLES, width, SAMPLES).mean(axis=(1, 3))
     return _read_out(picture, shot, rng), truth
@@ -147,9 +147,11 @@ class _Lens:
     middle: np.ndarray
     bend: float
 
-    def straight(self, px: np.ndarray) -> np.ndarray:
-        off = (px - self.middle) / np.linalg.norm(self.middle)
-        return px + self.bend * (px - self.middle) * (off**2).sum(axis=-1, keepdims=True)
+    def straight(self, px: np.ndarray, axis: int = -1) -> np.ndarray:
+        """Places before the lens bends them; `axis` has both coordinates."""
+        off = px - (self.middle if axis else self.middle[:, None, None])
+        bend = self.bend / (self.middle @ self.middle)
+        return px + bend * off * (off**2).sum(axis=axis, keepdims=True)
 
     def bent(self, px: np.ndarray) -> np.ndarray:
         found = px.copy()
@@ -162,12 +164,14 @@ def _covered(x, y, lines, light, ink):
     """Share of each sub-pixel that is light."""
     near = [_nearest(value, line) for value, line in zip((x, y), lines, strict=True)]
     (at_x, off_x), (at_y, off_y) = near
-    (wide_x, reach_x), (wide_y, reach_y) = _extent(x), _extent(y)
+    slopes_x, slopes_y = _slopes(x), _slopes(y)
     picture = light[at_y + (off_y > 0), at_x + (off_x > 0)]
     # Elsewhere, no edge comes into the sub-pixel.
-    cut = (np.abs(off_x) < reach_x + abs(ink)) | (np.abs(off_y) < reach_y + abs(ink))
+    cut = (np.abs(off_x) < _reach(slopes_x) + abs(ink)) | (
+        np.abs(off_y) < _reach(slopes_y) + abs(ink)
+    )
     at_x, off_x, at_y, off_y = (value[cut] for value in (at_x, off_x, at_y, off_y))
-    wide_x, wide_y = wide_x[:, cut], wide_y[:, cut]
+    wide_x, wide_y = _spreads(slopes_x, cut), _spreads(slopes_y, cut)
     cells = [[light[at_y + j, at_x + i] for i in (0, 1)] for j in (0, 1)]
     # Dark grows by the ink: an edge from dark to light moves towards the light side.
     share_x = [_beyond(wide_x, off_x - ink * (row[1] - row[0])) for row in cells]
@@ -180,14 +184,18 @@ def _covered(x, y, lines, light, ink):
     return picture
 
 
-def _discs(board, target, ink):
+def _discs(x, y, target, ink):
     """Likewise around circles, whose edges are straight within a sub-pixel."""
     places = corner_positions(target)[:, :2] / target.square_m
     radius = target.diameter_m / target.square_m / 2 + ink
-    away = KDTree(places).query(board.reshape(-1, 2))[0].reshape(board.shape[:2])
-    wide, reach = _extent(away)
-    share, cut = (away > radius).astype(float), np.abs(away - radius) < reach
-    share[cut] = _beyond(wide[:, cut], away[cut] - radius)
+    # Farther away, it does not matter how far.
+    most = 1.5 * radius
+    board = np.column_stack([x.ravel(), y.ravel()])
+    found = KDTree(places).query(board, distance_upper_bound=most)[0]
+    away = np.minimum(found, most).reshape(x.shape)
+    slopes = _slopes(away)
+    share, cut = (away > radius).astype(float), np.abs(away - radius) < _reach(slopes)
+    share[cut] = _beyond(_spreads(slopes, cut), away[cut] - radius)
     return share
 
 
@@ -198,12 +206,21 @@ def _nearest(places, lines):
     return at, places - lines[at]
 
 
-def _extent(field):
-    """Both even spreads (2, h, w) of a sub-pixel's places, the larger first, and half their sum."""
-    down, right = (np.maximum(np.abs(value), 1e-9) for value in np.gradient(field))
-    large, small = np.maximum(down, right), np.minimum(down, right)
-    small = np.maximum(small, 1e-3 * large)
-    return np.stack([large, small]), (large + small) / 2
+def _slopes(field):
+    """By how much a field changes from sub-pixel to sub-pixel, downwards and to the right."""
+    return [np.maximum(np.abs(value), 1e-9) for value in np.gradient(field)]
+
+
+def _reach(slopes):
+    """Half of what a sub-pixel's places spread over, or a thousandth more."""
+    return 0.5005 * (slopes[0] + slopes[1])
+
+
+def _spreads(slopes, cut):
+    """Both even spreads (2, k) of the places in some sub-pixels, the larger first."""
+    down, right = (value[cut] for value in slopes)
+    large = np.maximum(down, right)
+    return np.stack([large, np.maximum(np.minimum(down, right), 1e-3 * large)])
 
 
 def _beyond(wide, off):

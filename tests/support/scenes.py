@@ -50,7 +50,8 @@ class Scene:
             middle, grain = rng.uniform(-0.4, 0.4, 2), texture(rng)
             near = along < depth
             if number:
-                near &= np.all(np.abs(hits[..., :2] - middle) < 0.2, axis=2)
+                for axis in (0, 1):
+                    near &= np.abs(hits[..., axis] - middle[axis]) < 0.2
             texel = (hits[..., :2] / 0.0015).astype(np.float32)
             drawn = cv2.remap(grain, texel, None, cv2.INTER_LINEAR, None, cv2.BORDER_WRAP)
             seen, depth = np.where(near, drawn, seen), np.where(near, along, depth)

@@ -422,7 +422,7 @@ def test_a_small_board_is_seen_among_larger_dark_things():
     np.testing.assert_allclose(numbered(seen, truth + 300), truth + 300, atol=0.1)
 
 
-@pytest.mark.parametrize("change", [{"columns": 5}, {"asymmetric": False}])
+@pytest.mark.parametrize("change", [{"columns": 5}, slow({"asymmetric": False})])
 def test_another_page_of_circles_is_refused(change):
     found = find_target(photograph(SHIFTED, CIRCLES_SHOT, 2)[0], replace(SHIFTED, **change))
     assert isinstance(found, NotFound)
