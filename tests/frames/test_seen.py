@@ -1,5 +1,6 @@
 """Tools and fixtures placed by what images show: the frame, what is left out, what is refused."""
 
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -139,6 +140,25 @@ def test_views_from_several_sides_show_the_size_of_a_target(draws):
     assert np.median(sigmas) < 0.2
     # Of 48 degrees of freedom: sqrt(2 / 48) = 0.2; of 18 they are two sigma.
     assert 0.5 < np.mean(surprises) < 1.6
+
+
+@pytest.mark.parametrize("share", [0.01, -0.008])
+def test_a_board_of_another_size_than_stated_is_named_by_images_from_several_sides(share):
+    cell, calibration = calibrated(IN_HAND, 0)
+    rng = np.random.default_rng(3)
+    place, side = place_of(cell, "base", rng), BOARD.square_m * (1 + share)
+    sights = sights_of(cell, "base", place, rng, 8, replace(BOARD, square_m=side))
+    words = place_seen(calibration, sights, BOARD, "base").warnings[0]
+    found = re.search(r"the board is ([\d.]+) % (larger|smaller) than stated", words)
+    sign = {"larger": 0.01, "smaller": -0.01}[found[2]]
+    # Eight images at half a metre place the board to 0.1 mm each, 0.01 % of their distance.
+    assert sign * float(found[1]) == pytest.approx(share, abs=3e-4)
+    moved = sights_of(cell, "base", place, rng, 8)
+    # A fixture that was moved between the images is of no other size.
+    moved[:4] = sights_of(cell, "base", place @ exp(np.array([0, 0, 0.01, 0.01, 0, 0])), rng, 4)
+    found = place_seen(calibration, moved, BOARD, "base")
+    assert found.warnings
+    assert not any("if the board" in warning for warning in found.warnings)
 
 
 def test_an_error_of_all_images_is_no_scatter_and_one_of_a_single_image_leaves_it_out():

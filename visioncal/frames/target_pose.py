@@ -23,7 +23,7 @@ from visioncal.core.arguments import check_fields, typed
 from visioncal.core.errors import DataError
 from visioncal.core.linalg import covariance_from, squared_lengths
 from visioncal.core.number_format import figure, mm_and_deg
-from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, f_limit
+from visioncal.core.quantiles import FALSE_ALARM, FALSE_REJECTION, chi2_limit, f_limit
 from visioncal.core.robust import Distances, nearest, settled, trimmed_sum
 from visioncal.core.transforms import adjoint, compose, exp, invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Image, IntArray, Mask, Target
@@ -35,6 +35,9 @@ from visioncal.vision.targets import load_target
 Parent: TypeAlias = Literal["base", "flange"]
 # Squared distance beyond which two poses differ significantly.
 _DIFFERENT = float(chi2_limit(0.05, 6))
+# Sigma of a board's size where another one is tried, the least error that is named, and the share
+# of the scatter that it explains.
+_ANY_SIZE, _LEAST_SIZE, _EXPLAINED = 0.1, 2e-3, 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +168,7 @@ class _ImageInliers:
     mahalanobis_sq: FloatArray  # (m,) its squared Mahalanobis distance; six on average under noise.
     limit: float  # Its outlier limit.
     variance: float  # Variance factor of the images' independent errors; at least one.
+    errors: FloatArray  # (c,) expected errors that all images share, by how they disagree.
     # Another pose that is a candidate of all inliers; None where there is none.
     rival: FloatArray | None
 
@@ -206,7 +210,8 @@ class _ImageSearch:
         # target is, and where the camera is.
         weights = np.where(agrees[:, None, None], np.linalg.inv(of_images), 0.0)
         values, vectors = np.linalg.eigh(candidates.common)
-        rooted = by_common @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        rooted = by_common @ root
         against = weights @ rooted
         inner = np.einsum("mij,mik->jk", rooted, against) + np.eye(len(values))
         net_weights = weights - against.sum(axis=0) @ np.linalg.solve(
@@ -231,9 +236,8 @@ class _ImageSearch:
         )
         # Six degrees of freedom for each image beyond the first, less what they share.
         seen = np.einsum("mij,mi->j", against, errors)
-        total = np.einsum("mi,mij,mj", errors, weights, errors) - seen @ np.linalg.solve(
-            inner, seen
-        )
+        expected = np.linalg.solve(inner, seen)
+        total = np.einsum("mi,mij,mj", errors, weights, errors) - seen @ expected
         variance = max(float(total) / (6.0 * others), 1.0) if others else 1.0
         # An image's own errors are in the mean, too, where it is a part of that.
         covariance = of_images + shared + of_mean - carried - np.swapaxes(carried, 1, 2)
@@ -251,6 +255,7 @@ class _ImageSearch:
             mahalanobis_sq,
             candidates.limit,
             variance,
+            root @ expected,
             _rival(candidates, matrix, agrees, variance),
         )
 
@@ -386,7 +391,8 @@ def place_target(
     ]
     common = np.asarray(block_diag(eye.shared_covariance, [[looks[0].scale_sigma ** 2]]))
     stops = len({*keys}) if needs_robot(eye, parent) else None
-    fit = _find_inliers(_CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
+    candidates = _CandidateViews(views, eye.flange_noise, common, eye.noise_dof)
+    fit = _find_inliers(candidates)
     labels = tuple(sight.label for sight in sights)
     return TargetPose(
         fit.matrix,
@@ -399,9 +405,31 @@ def place_target(
         (
             *eye.warnings,
             *(words for look in looks for words in look.warnings),
+            *_size_warning(fit, candidates),
             *_inlier_warnings(fit, labels, looks, stops),
         ),
     )
+
+
+def _size_warning(fit: _ImageInliers, candidates: _CandidateViews) -> Iterator[str]:
+    """Warning on a board of another size, where that makes images from several sides agree."""
+    scatter = 6.0 * (int(fit.inliers.sum()) - 1) * (fit.variance - 1.0)
+    if scatter < chi2_limit(FALSE_ALARM, 1):
+        return
+    common = candidates.common.copy()
+    common[-1, -1] = _ANY_SIZE**2
+    sized = _find_inliers(replace(candidates, common=common))
+    share = float(sized.errors[-1])
+    is_explained = sized.variance - 1.0 < (1.0 - _EXPLAINED) * (fit.variance - 1.0)
+    if is_explained and abs(share) > _LEAST_SIZE and sized.inliers.sum() >= fit.inliers.sum():
+        # A board that is larger is seen as if the stated one were nearer.
+        than = "larger" if share < 0.0 else "smaller"
+        yield (
+            f"The images agree if the board is {figure(100.0 * abs(share))} % {than} than stated "
+            f"(scatter {figure(np.sqrt(sized.variance))} times the calibration's noise, "
+            f"{figure(np.sqrt(fit.variance))} as stated), or the lens was focused anew: measure "
+            "the board, and state its size in its .toml."
+        )
 
 
 def _inlier_warnings(
