@@ -11,7 +11,7 @@ from support.wrong_arms import GOOD
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.fit.candidates import effects_of_frames, scored
-from visioncal.fit.processes import _alone, _boards, _grid_of, judged
+from visioncal.fit.processes import _boards, _errors_by_stop, _grid_of, judged
 from visioncal.fit.score import added_by, of_effect, products
 from visioncal.fit.solve import solve
 from visioncal.model import read_cell
@@ -81,7 +81,7 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
     fit = solve(made(1, 16).cell).fit
     for effect in effects_of_frames(fit, "flange"):
         each = products(fit, added_by(fit, effect), effect.count)
-        alone = _alone(fit, "flange", [each])
+        alone = _errors_by_stop(fit, "flange", [each])
         grid, beside = _grid_of(fit, "flange", alone, creeps=True)
         white = beside(next(grid))
         # With boards held as the fit has them.

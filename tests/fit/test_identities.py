@@ -97,7 +97,7 @@ def with_field(unknowns, state, pairs):
     """A field of the lens, that is zero: where it is not, it moves with the pixels."""
     px = np.concatenate([pair.px for pair in pairs if pair.corners])
     (field,) = fields_of_lengths(TABLE.resolution[0], px, (0.4,))
-    field = field.shown(px, 0.5).beside(unknowns.lenses["cam"], px)
+    field = field.shown(px, 0.5).orthogonal_to(unknowns.lenses["cam"], px)
     assert 4 < field.count < 40
     member = lens_field("cam", field, 0.1)
     unknowns = replace(unknowns.with_members(member), fields={"cam": field})
@@ -278,7 +278,7 @@ def assert_left_out_as_by_refits(fit, left_out):
     for row in (0, 5, 11):
         rows = np.arange(len(fit.used)) == row
         refit = without_poses(fit, rows).left_out()
-        sigma = np.sqrt(np.diagonal(left_out.own[row]))
+        sigma = np.sqrt(np.diagonal(left_out.measured[row]))
         assert left_out.away[row] == pytest.approx(refit.away[row], abs=1e-3 * sigma.min())
         assert left_out.squares[row] == pytest.approx(refit.squares[row], rel=1e-3)
 

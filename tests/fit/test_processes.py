@@ -13,7 +13,7 @@ from visioncal.core.transforms import invert, log
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.inliers import Search
 from visioncal.fit.kernels import processes
-from visioncal.fit.processes import _alone, _boards, _grid_of, consider, judged
+from visioncal.fit.processes import _boards, _errors_by_stop, _grid_of, consider, judged
 from visioncal.fit.solve import _explained, solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.fit.unknowns import State
@@ -30,7 +30,7 @@ def two_arms():
 def test_information_of_single_stops_adds_up_to_that_of_the_fit(cell):
     fit, p = solve(cell).fit, None
     for flange in fit.unknowns.erring:
-        alone = _alone(fit, flange)
+        alone = _errors_by_stop(fit, flange)
         p = fit.unknowns.count
         total = alone.rest.copy()
         noise = np.linalg.inv(alone.known + alone.independent)
@@ -130,7 +130,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     shape = fit.state.values["shape", "target"] + 1e-4 * np.eye(10)[0]
     state = State({**fit.state.values, ("shape", "target"): shape}, fit.state.errors)
     fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
-    alone = _alone(fit, "flange")
+    alone = _errors_by_stop(fit, "flange")
     (board,) = _boards(fit)
     grid, beside = _grid_of(fit, "flange", alone, creeps=True)
     white = beside(next(grid))
@@ -185,7 +185,7 @@ def test_a_board_that_is_doubted_and_not_freed_counts_in_the_covariance(draws):
 @pytest.mark.slow
 def test_evidence_by_combinations_of_many_unknowns_is_the_same():
     fit = solve(made(stops=8, cameras=4).cell).fit
-    alone, boards = _alone(fit, "flange"), _boards(fit)
+    alone, boards = _errors_by_stop(fit, "flange"), _boards(fit)
     assert fit.unknowns.count > 6 * len(alone.stops)
     rows, sizes = alone.rows.reshape(-1, alone.rows.shape[2]), np.eye(fit.unknowns.count)
     found, values = [], []

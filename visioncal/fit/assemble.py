@@ -17,10 +17,10 @@ def bodies_of(cell: Cell, unknowns: Unknowns, grams: Sequence[Gram]) -> tuple[Bo
     found = []
     for names in cell.bodies:
         flanges = tuple(name for name in names if name in unknowns.erring)
-        own = [gram for gram in grams if set(gram.flanges) & set(flanges)]
-        if own:
-            stops = np.unique(np.concatenate([gram.stops for gram in own]))
-            columns = np.unique(np.concatenate([gram.columns for gram in own]))
+        body_grams = [gram for gram in grams if set(gram.flanges) & set(flanges)]
+        if body_grams:
+            stops = np.unique(np.concatenate([gram.stops for gram in body_grams]))
+            columns = np.unique(np.concatenate([gram.columns for gram in body_grams]))
             found.append(Body(flanges, stops, columns))
     return tuple(found)
 
@@ -39,10 +39,10 @@ def mixed_model(
     for at, body in enumerate(bodies):
         for place, name in enumerate(body.flanges):
             for part, unit in enumerate(("rad", "m")):
-                own = 6 * place + 3 * part + np.arange(3)
+                places = 6 * place + 3 * part + np.arange(3)
                 size = unknowns.size_of(f"{unit} {name}")
                 past = state.errors[name][body.stops, 3 * part : 3 * part + 3]
-                terms.setdefault(size, []).append(_flange_term(size, at, body.width, own, past))
+                terms.setdefault(size, []).append(_flange_term(size, at, body.width, places, past))
     offsets = unknowns.offsets(state)
     for size, columns, sigma in unknowns.priors():
         terms.setdefault(size, []).append(prior_term(size, columns, offsets[columns], sigma))
@@ -65,23 +65,25 @@ def _terms(gram: Gram, bodies: Sequence[Body]) -> list[Term]:
         parts: tuple[Part, ...] = ()
         if f:
             body = bodies[at]
-            units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
+            units, columns = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
             # Of many stops a few alone are in these sightings.
             held, units = np.unique(units, return_inverse=True)
             errors = np.zeros((len(held), body.width, body.width))
             cross = np.zeros((len(held), body.width, len(common)))
-            np.add.at(errors, (units[:, None, None], own[:, None], own), of_errors[:, :, :f])
-            np.add.at(cross, (units[:, None], own), of_errors[:, :, f:])
+            np.add.at(
+                errors, (units[:, None, None], columns[:, None], columns), of_errors[:, :, :f]
+            )
+            np.add.at(cross, (units[:, None], columns), of_errors[:, :, f:])
             parts = (Part(at, gram.columns, errors, cross, held),)
         count = float(products.counts.sum())
         found.append(Term(products.size, count, gram.columns, common, parts))
     return found
 
 
-def _flange_term(size: int, body: int, width: int, own: IntArray, past: FloatArray) -> Term:
+def _flange_term(size: int, body: int, width: int, columns: IntArray, past: FloatArray) -> Term:
     """Rows of the errors (u, 3) of one flange, of which some are in the state already."""
     errors, cross = np.zeros((len(past), width, width)), np.zeros((len(past), width, 1))
-    errors[:, own, own], cross[:, own, 0] = 1.0, -past
+    errors[:, columns, columns], cross[:, columns, 0] = 1.0, -past
     none = np.zeros(0, dtype=np.int64)
     square = np.array([[float(np.sum(past**2))]])
     return Term(size, float(past.size), none, square, (Part(body, none, errors, cross),))

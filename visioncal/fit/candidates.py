@@ -113,7 +113,7 @@ def opened(
         if one.effect is not None:
             kind, known, rivals = one.effect.kind, unknowns.rivals, set[str]()
             # An effect may be the rest of one whose rival it was.
-            rivals.update(*({first, *own} for first, own in known.items() if kind in own))
+            rivals.update(*({first, *kinds} for first, kinds in known.items() if kind in kinds))
             rivals |= {
                 other.effect.kind
                 for other in clear
@@ -134,7 +134,7 @@ def opened(
             field, table = one.field, fit.cell.cameras[one.lens]
             px = np.concatenate([pair.px for pair in images_of(pairs, one.lens)])
             if table.stated is None:
-                field = field.beside(unknowns.lenses[one.lens], px)
+                field = field.orthogonal_to(unknowns.lenses[one.lens], px)
             elif table.intrinsics == "auto":
                 # A field may stand for parameters that were held since corners were few.
                 given = given_lens(table, one.lens, px, is_spare=True)
@@ -257,8 +257,8 @@ def scored(
         if effect.name not in known and effect.count:
             bounds = effect.size
             # One of very many unknowns is judged by some of them.
-            own = of_effect(fit, effect.typical, pairs)
-            best = own.best(np.ones(len(own.pull)), bounds.low, bounds.high)
+            effect_score = of_effect(fit, effect.typical, pairs)
+            best = effect_score.best(np.ones(len(effect_score.pull)), bounds.low, bounds.high)
             found.append((effect, *best, np.nan))
     if flange:
         # An effect that gains little beside independent noise gains less beside errors that last;
@@ -270,9 +270,9 @@ def scored(
             _, place = max(creeps, default=(0.0, ()))
             clear += [one for one in steps(fit, flange, place) if one.name not in known]
         added = [(one, added_by(fit, one, pairs)) for one in clear]
-        beside = processes.scored(fit, flange, added) if clear else []
-        others = [one for one in found if one[0] not in (clear if beside else ())]
-        found = [*others, *((one, *best) for one, best in zip(clear, beside, strict=False))]
+        lasting_scores = processes.scored(fit, flange, added) if clear else []
+        others = [one for one in found if one[0] not in (clear if lasting_scores else ())]
+        found = [*others, *((one, *best) for one, best in zip(clear, lasting_scores, strict=False))]
     for effect, size, gain, explained in found:
         # When something was moved is a free choice.
         off = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps | JointsStep) else 0.0
@@ -394,7 +394,7 @@ def beside_zooms(
     fit: Fit, changes: Iterable[Candidate], anyway: Collection[str] = ()
 ) -> Iterator[Candidate]:
     """Candidates that change a lens, and that it changed at once beside clear ones, or anyway."""
-    clear, grown, alone = set(anyway), dict[str, float](), dict[str, Candidate]()
+    clear, grown, single = set(anyway), dict[str, float](), dict[str, Candidate]()
     for one in changes:
         yield one
         if 2.0 * one.gain >= SIGNIFICANT and one.lens:
@@ -403,15 +403,15 @@ def beside_zooms(
             grown[one.lens] = max(one.gain, grown.get(one.lens, -np.inf))
     for camera in clear:
         # Where views disagree, a stated lens may be that of either part.
-        both = camera in anyway and fit.cell.cameras[camera].stated is not None
+        may_be_first = camera in anyway and fit.cell.cameras[camera].stated is not None
         for kind in (LensSteps, LensChanges):
-            for one in scored(fit, zooms(fit, camera, kind, (False, True)[: 1 + both])):
-                alone[one.name] = max(one, alone.get(one.name, one), key=lambda at: at.gain)
-    likeliest = [one.effect for one in alone.values() if one.effect is not None]
+            for one in scored(fit, zooms(fit, camera, kind, (False, True)[: 1 + may_be_first])):
+                single[one.name] = max(one, single.get(one.name, one), key=lambda at: at.gain)
+    likeliest = [one.effect for one in single.values() if one.effect is not None]
     for one in scored(fit, likeliest, sole_flange(fit)):
         # A lens that grows is judged beside an arm's lasting errors, as is a frame that moved.
         # Where it explains more there, so is one that changed at once.
-        most = alone[one.name].gain
+        most = single[one.name].gain
         is_less = one.gain < grown.get(one.lens, -np.inf)
         yield replace(one, gain=min(one.gain, most) if is_less else max(one.gain, most))
 
@@ -421,7 +421,7 @@ def zooms(
 ) -> Iterator[Effect]:
     """Changes of a lens at once: rivals to what grows, and to what differs from stop to stop."""
     grams = [(gram.stops, fit.used[gram.rows]) for gram in fit.grams if gram.pair[0] == camera]
-    stops = np.unique(np.concatenate([own[used] for own, used in grams]))
+    stops = np.unique(np.concatenate([gram_stops[used] for gram_stops, used in grams]))
     changed = (evenly(len(stops) - 3, _ZOOMS) + 2).tolist()
     for at, is_first in product(changed, are_first):
         yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]), is_first)

@@ -48,12 +48,12 @@ class Candidates:
     @classmethod
     def of(cls, poses: Sequence[FloatArray], turns: Sequence[Sequence[int] | IntArray]) -> Self:
         """Collects the (c, 4, 4) candidates of each view, and their (c,) turns."""
-        counts = np.array([len(own) for own in poses], dtype=np.int64)
+        counts = np.array([len(view_poses) for view_poses in poses], dtype=np.int64)
         numbers = np.arange(counts.max(initial=1))
         valid = numbers < counts[:, None]
         at = np.minimum(numbers, counts[:, None] - 1)
-        padded = [own[rows] for own, rows in zip(poses, at, strict=True)]
-        turned = [np.asarray(own)[rows] for own, rows in zip(turns, at, strict=True)]
+        padded = [view_poses[rows] for view_poses, rows in zip(poses, at, strict=True)]
+        turned = [np.asarray(view_turns)[rows] for view_turns, rows in zip(turns, at, strict=True)]
         return cls(np.array(padded), np.array(turned), valid)
 
     def take(self, rows: IntArray) -> Self:

@@ -18,7 +18,7 @@ from visioncal.vision.camera import with_intrinsics
 _RIDGE = 1e-9
 
 
-# `away`, `predicted` and `own` of some sightings.
+# `away`, `predicted` and `measured` of some sightings.
 _Deviation: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
@@ -28,23 +28,23 @@ class LeftOut:
 
     away: FloatArray  # (n, 6) as a right perturbation of `seer_from_seen`.
     predicted: FloatArray  # (n, 6, 6) covariance of the prediction.
-    own: FloatArray  # (n, 6, 6) covariance of the sighting's own pose.
+    measured: FloatArray  # (n, 6, 6) covariance of the pose by the sighting itself.
     directions: IntArray  # (n,) how many of the six it has; in others its covariance is large.
 
     @classmethod
     def of(cls, cell: Cell, found: Iterable[tuple[IntArray, _Deviation]]) -> Self:
         """Deviations of n sightings, given for some rows at a time; zeros for absent rows."""
         count = len(cell.sightings)
-        away, predicted, own = (np.zeros((count, *shape)) for shape in ((6,), (6, 6), (6, 6)))
+        away, predicted, measured = (np.zeros((count, *shape)) for shape in ((6,), (6, 6), (6, 6)))
         for rows, values in found:
-            away[rows], predicted[rows], own[rows] = values
+            away[rows], predicted[rows], measured[rows] = values
         directions = np.array([sighting.directions for sighting in cell.sightings], np.int64)
-        return cls(away, predicted, own, directions)
+        return cls(away, predicted, measured, directions)
 
     @cached_property
     def squares(self) -> FloatArray:
         """(n,) squared Mahalanobis lengths."""
-        solved = np.linalg.solve(self.predicted + self.own, self.away[:, :, None])[:, :, 0]
+        solved = np.linalg.solve(self.predicted + self.measured, self.away[:, :, None])[:, :, 0]
         return np.asarray(np.sum(self.away * solved, axis=1))
 
 
@@ -89,8 +89,8 @@ class Fit:
     def errors(self) -> Mapping[str, FloatArray]:
         """(s, 6) by which each flange's errors differ from those of `linearised`."""
         found = {}
-        for body, own in zip(self.mixed.bodies, self.estimate.bodies, strict=True):
-            errors = own.errors + own.response @ self.moved_by[body.columns]
+        for body, solved in zip(self.mixed.bodies, self.estimate.bodies, strict=True):
+            errors = solved.errors + solved.response @ self.moved_by[body.columns]
             for place, name in enumerate(body.flanges):
                 found[name] = np.zeros_like(self.linearised.errors[name])
                 found[name][body.stops] = errors[:, 6 * place : 6 * place + 6]
@@ -132,16 +132,18 @@ class Fit:
     def camera(self, name: str) -> Camera:
         """A lens alone, without its field: what matrix and distortion explain best.
 
-        A stated lens is as far from itself as they explain of its field, over the image: beyond the
-        corners, where its field fades, distortion that these alone determine would grow.
+        A stated lens is as far from itself as these explain of its field, over the image: beyond
+        the corners, where its field fades, distortion that these alone determine would grow.
         """
         values, field = self.state.values["lens", name], self.unknowns.fields.get(name)
         if field is not None and field.instead is None:
             lens = self.unknowns.camera(self.state, name)
             axes = (np.linspace(0.0, side - 1.0, 33) for side in lens.resolution)
-            own = field.beside(lens, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)).instead
-            if own is not None:
-                values = values + own @ self.state.values["field", name]
+            by_field = field.orthogonal_to(
+                lens, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+            ).instead
+            if by_field is not None:
+                values = values + by_field @ self.state.values["field", name]
         return with_intrinsics(self.unknowns.lenses[name], values)
 
     def covariance(self, *keys: Key) -> FloatArray:
@@ -163,29 +165,29 @@ class Fit:
 
     def _left_out(self, gram: Gram) -> _Deviation:
         heads, f = gram.heads(self.estimate.logs), 6 * len(gram.flanges)
-        alone, mapped = _alone(heads)
+        measured, mapped = _sighting_poses(heads)
         by_unknowns = gram.by_unknowns(mapped)
         columns, by_errors, jacobian = gram.columns, by_unknowns[:, :, :f], by_unknowns[:, :, f:]
         values = jacobian @ self.estimate.values[columns]
-        covariance = np.zeros_like(alone)
+        covariance = np.zeros_like(measured)
         if f:
             at = body_with(self.mixed.bodies, gram.flanges)
             body, solved = self.mixed.bodies[at], self.estimate.bodies[at]
-            units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
-            through = by_errors @ solved.response[units[:, None], own]
+            units, places = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
+            through = by_errors @ solved.response[units[:, None], places]
             through[:, :, np.searchsorted(body.columns, columns)] += jacobian
             columns, jacobian = body.columns, through
-            errors = solved.own[units[:, None, None], own[:, None], own]
+            errors = solved.covariance[units[:, None, None], places[:, None], places]
             covariance = by_errors @ errors @ np.swapaxes(by_errors, 1, 2)
-            values += (by_errors @ solved.errors[units[:, None], own][:, :, None])[:, :, 0]
+            values += (by_errors @ solved.errors[units[:, None], places][:, :, None])[:, :, 0]
         common = self.estimate.covariance[columns[:, None], columns]
         covariance = covariance + jacobian @ common @ np.swapaxes(jacobian, 1, 2)
         part = self.used[gram.rows][:, None, None]
-        own_pose = alone @ heads[:, :6, -1, None]
-        share = part * np.linalg.solve(alone, covariance).swapaxes(1, 2)
+        own_pose = measured @ heads[:, :6, -1, None]
+        share = part * np.linalg.solve(measured, covariance).swapaxes(1, 2)
         rest, known = np.eye(6) - share, values[:, :, None]
         away = own_pose - np.linalg.solve(rest, known - share @ own_pose)
-        return away[:, :, 0], np.asarray(np.linalg.solve(rest, covariance), dtype=float), alone
+        return away[:, :, 0], np.asarray(np.linalg.solve(rest, covariance), dtype=float), measured
 
     def predict(self, seer: str, seen: str, moments: Moments) -> Prediction:
         """Predicts where a frame will be in another, with covariance.
@@ -208,8 +210,8 @@ class Fit:
             if effect.place == "edge" and effect.frame in at.slopes:
                 values = self.state.values["effect", effect.name]
                 columns = effect.slopes(moments, values)
-                own = self.unknowns.columns("effect", effect.name)
-                jacobian[:, :, own] += at.by_effects[effect.frame] @ columns
+                effect_columns = self.unknowns.columns("effect", effect.name)
+                jacobian[:, :, effect_columns] += at.by_effects[effect.frame] @ columns
         calibration = jacobian @ self.whole @ np.swapaxes(jacobian, 1, 2)
         return Prediction(at.poses, jacobian, calibration, noise)
 
@@ -220,7 +222,7 @@ class Fit:
         return replace(self, considered=known + added, shift=moved)
 
 
-def _alone(heads: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sighting_poses(heads: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses by (k, h, d + 1) products of k sightings' own rows, given what else these depend on.
 
     Returns:
@@ -230,6 +232,6 @@ def _alone(heads: FloatArray) -> tuple[FloatArray, FloatArray]:
     pose = information[:, :, :6]
     scale = np.maximum(np.trace(pose, axis1=1, axis2=2), 1.0)
     diagonal = np.diagonal(pose, axis1=1, axis2=2) + 1e-3 * scale[:, None]
-    alone = np.linalg.inv(pose + _RIDGE * diagonal[:, :, None] * np.eye(6))
-    other = alone @ information[:, :, 6:]
-    return alone, np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)
+    covariance = np.linalg.inv(pose + _RIDGE * diagonal[:, :, None] * np.eye(6))
+    other = covariance @ information[:, :, 6:]
+    return covariance, np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)

@@ -32,7 +32,7 @@ def doubted_boards(considered: Iterable[Considered]) -> dict[Key, float]:
 def with_held_boards(fit: Fit, considered: Iterable[Considered]) -> Fit:
     """The fit with what boards whose size is held may be off by in its covariance.
 
-    They are as stated, or of any size, as `considered` beside lasting errors of an arm.
+    Boards are as stated, or of any size, as `considered` beside lasting errors of an arm.
     """
     squares = doubted_boards(considered)
     covariance, added = fit.estimate.covariance, np.zeros((fit.unknowns.count,) * 2)
@@ -40,8 +40,8 @@ def with_held_boards(fit: Fit, considered: Iterable[Considered]) -> Fit:
         for prior in member.priors:
             if prior.considered > 0.0:
                 at = fit.unknowns.columns(*member.key)[prior.columns]
-                own = covariance[at[:, None], at]
-                slope = np.linalg.solve(own, covariance[at]).T
+                board_covariance = covariance[at[:, None], at]
+                slope = np.linalg.solve(board_covariance, covariance[at]).T
                 square = prior.considered**2 + squares.get(member.key, 0.0)
                 added += slope * square @ slope.T
     return fit.considering(added)
@@ -60,8 +60,8 @@ def with_held_lenses(fit: Fit) -> Fit:
     unknowns = fit.unknowns.with_members(*lenses)
     grams = linearised(fit.cell, unknowns, fit.linearised, pairs_of(fit.cell))
     mixed = mixed_model(fit.cell, unknowns, fit.linearised, grams, fit.used)
-    both, first = mixed.at(fit.estimate.logs, is_sloped=False).covariance, fit.unknowns.count
-    slope = np.linalg.solve(both[first:, first:], both[first:, :first]).T
+    joint, first = mixed.at(fit.estimate.logs, is_sloped=False).covariance, fit.unknowns.count
+    slope = np.linalg.solve(joint[first:, first:], joint[first:, :first]).T
     sigmas = np.concatenate([np.full(lens.count, lens.priors[0].sigma) for lens in lenses])
     return fit.considering((slope * sigmas**2) @ slope.T)
 
@@ -69,8 +69,8 @@ def with_held_lenses(fit: Fit) -> Fit:
 def with_small_sizes(fit: Fit) -> Fit:
     """The fit with what random unknowns may be whose size chance explains, in its covariance.
 
-    They are in no estimate. A priori, a size is none as likely as it is some, with a uniform
-    logarithm; its posterior is by the score of the unknowns.
+    Such unknowns are in no estimate. A priori, a size is none as likely as it is some, with a
+    uniform logarithm; its posterior is by the score of the unknowns.
     """
     covariance, unknowns = fit.estimate.covariance, fit.unknowns
     added = np.zeros((unknowns.count,) * 2)
@@ -84,12 +84,12 @@ def with_small_sizes(fit: Fit) -> Fit:
             shown = inner - np.eye(len(at)) / prior.size.low**2
             score = Score(inner @ values[at], (shown + shown.T) / 2, np.inf)
             sizes, gains = score.posterior(prior.size.low, prior.size.high)
-            # As likely as all of these is none.
+            # A size of zero is as likely as all of these together.
             weights = np.exp(gains - np.logaddexp.reduce([*gains, np.log(len(gains))]))
             slope = covariance[:, at] @ inner
             for size, weight in zip(sizes.tolist(), weights.tolist(), strict=True):
-                own = np.linalg.inv(score.information + np.eye(len(at)) / size**2)
-                away = own @ score.pull - values[at]
-                more = own - covariance[at[:, None], at] + np.outer(away, away)
+                posterior = np.linalg.inv(score.information + np.eye(len(at)) / size**2)
+                away = posterior @ score.pull - values[at]
+                more = posterior - covariance[at[:, None], at] + np.outer(away, away)
                 added += slope @ (weight * more) @ slope.T
     return fit.considering(added)

@@ -235,8 +235,8 @@ class Network:
             name
             for value, rival, *_ in tried[1:]
             if value < CLEAR_RATIO * score
-            for name, own, other in zip(by_turn, chosen, rival, strict=False)
-            if own != other
+            for name, turn, other in zip(by_turn, chosen, rival, strict=False)
+            if turn != other
         }
         names = tuple(name for name in self.tree.branches if name in ambiguous)
         return joined, names, relations
@@ -357,19 +357,19 @@ class Network:
             return best, None
         for shift in _SHIFTS:
             last = len(next(iter(self.poses.values())))
-            there = np.flatnonzero((stops + shift >= 0) & (stops + shift < last))
-            robots = [self.poses[step.robot][stops[there] + shift] for step in pair.robots]
-            there = there[np.isfinite(robots).all(axis=(0, 2, 3))]
-            if len(there) < max(half, FEWEST_VIEWS):
+            in_range = np.flatnonzero((stops + shift >= 0) & (stops + shift < last))
+            robots = [self.poses[step.robot][stops[in_range] + shift] for step in pair.robots]
+            in_range = in_range[np.isfinite(robots).all(axis=(0, 2, 3))]
+            if len(in_range) < max(half, FEWEST_VIEWS):
                 continue
-            _, (before, moved, after) = self._parts(joined, pair, rows[there], shift)
-            shifted = self.candidates.take(rows[there]).carried(invert(before), invert(after))
+            _, (before, moved, after) = self._parts(joined, pair, rows[in_range], shift)
+            shifted = self.candidates.take(rows[in_range]).carried(invert(before), invert(after))
             edges = hand_eye(invert(moved), shifted)
             if edges is None:
                 continue
             near = seen.distances(invert(edges.x) @ between @ edges.z).min(axis=1)
             by_shift = np.full(len(rows), np.inf)
-            by_shift[there] = edges.residuals.min(axis=1)
+            by_shift[in_range] = edges.residuals.min(axis=1)
             either = np.minimum(near, by_shift)
             limit = _FAR * np.sort(either)[:half].mean()
             is_better = 4.0 * np.sort(either)[:half].sum() < np.sort(least)[:half].sum()
@@ -418,7 +418,7 @@ class Network:
             if len(np.unique(stops)) <= FEWEST_VIEWS:
                 continue
             ends = step.frame, self.tree.branches[step.frame].parent
-            beside, carrier = ends if step.is_up else ends[::-1]
+            instrument_frame, carrier = ends if step.is_up else ends[::-1]
             robot = self.poses[step.robot][stops]
             problem = mounting_problem(
                 invert(robot) if step.is_up else robot,
@@ -427,7 +427,7 @@ class Network:
             )
             mounting, errors = find_mounting(problem, np.unique(stops, return_inverse=True)[1])
             sigma_m = float(np.median(np.linalg.norm(errors, axis=1))) + AGREE_M
-            yield Relation(beside, seer, mounting.frame[None], sigma_m)
+            yield Relation(instrument_frame, seer, mounting.frame[None], sigma_m)
             for pair, point in zip(pairs, mounting.points, strict=True):
                 yield Relation(carrier, pair.seen, compose(np.eye(3), point)[None], sigma_m)
 

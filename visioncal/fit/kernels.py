@@ -62,7 +62,7 @@ def processes(
     size = np.sqrt(np.mean((levels / TWIST_UNITS) ** 2))
     flange = np.broadcast_to(np.diag(levels), (count, 6, 6))
     of_base = size * adjoint(invert(poses)) * TWIST_UNITS
-    both = np.concatenate([flange, of_base], axis=2)
+    joint_basis = np.concatenate([flange, of_base], axis=2)
     factors = np.concatenate([poses[:, :3, 3] / 0.6, poses[:, :3, 2]], axis=1)
     if as_reported:
         yield Process(1 / 4, beyond(factors @ factors.T), of_base)
@@ -72,13 +72,13 @@ def processes(
     squared = cdist(features, features, "sqeuclidean")
     for length in _RANGES:
         kernel = beyond(np.exp(-squared / (2.0 * length**2)))
-        yield Process(1 / 4 / len(_RANGES), kernel, both)
+        yield Process(1 / 4 / len(_RANGES), kernel, joint_basis)
     apart = np.abs(order[:, None] - order)
     for memory in _MEMORIES:
         yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange, True)
     if creeps:
         ramp = (order - order[-1]) / order.std()
-        yield Process(1 / 16, np.outer(ramp, ramp), both, is_of_time=True, is_creep=True)
+        yield Process(1 / 16, np.outer(ramp, ramp), joint_basis, is_of_time=True, is_creep=True)
 
 
 def _beyond_mean(kernel: FloatArray) -> FloatArray:
@@ -107,10 +107,10 @@ class StopErrors:
 
     def covariance(self, some: IntArray, white: float) -> FloatArray:
         """(d k, d k) of k stops beside errors that last, with independent ones times `white`."""
-        own = self.known[some] + white**2 * self.independent[some]
-        count, width = own.shape[:2]
+        stop_covariances = self.known[some] + white**2 * self.independent[some]
+        count, width = stop_covariances.shape[:2]
         covariance = np.zeros((count, width, count, width))
-        covariance[np.arange(count), :, np.arange(count)] = own
+        covariance[np.arange(count), :, np.arange(count)] = stop_covariances
         return covariance.reshape(count * width, -1)
 
 
@@ -127,8 +127,8 @@ class Tried:
     size: float = 0.0
     white: float = 1.0
 
-    def beside(self, rows: FloatArray, shared: "Shared") -> Self:
-        """The trial given rows (d k, r + c + 1) of k more stops."""
+    def with_stops(self, rows: FloatArray, shared: "Shared") -> Self:
+        """The trial with rows (d k, r + c + 1) of k more stops."""
         covariance = shared.independent[self.white]
         is_new = self.process is not None
         if self.process is not None:
@@ -150,9 +150,9 @@ class Shared:
     lasting: Mapping[Process, FloatArray]  # At a size of one.
 
     @classmethod
-    def of(cls, alone: StopErrors, some: IntArray, kinds: Iterable[Process]) -> Self:
+    def of(cls, stop_errors: StopErrors, some: IntArray, kinds: Iterable[Process]) -> Self:
         """Covariances at some stops (m,), of their own errors and of processes."""
         return cls(
-            {white: alone.covariance(some, white) for white in WHITE},
+            {white: stop_errors.covariance(some, white) for white in WHITE},
             {kind: kind.covariance(some) for kind in kinds},
         )

@@ -61,12 +61,12 @@ class Field:
         squares, vectors = np.linalg.eigh(step * each.T @ each)
         return replace(self, basis=self.sigmas[:, None] * vectors[:, squares > least])
 
-    def beside(self, lens: Camera, px: FloatArray) -> "Field":
+    def orthogonal_to(self, lens: Camera, px: FloatArray) -> "Field":
         """The field orthogonal to what an estimated lens does at (n, 2) corners."""
-        own, each = by_lens(lens, px), self.functions(px)
-        scale = np.linalg.norm(own, axis=(0, 1))
-        inner = np.einsum("nai,naj->ij", own / scale, own / scale)
-        pull = np.concatenate([own[:, axis].T @ each for axis in (0, 1)], axis=1)
+        lens_columns, each = by_lens(lens, px), self.functions(px)
+        scale = np.linalg.norm(lens_columns, axis=(0, 1))
+        inner = np.einsum("nai,naj->ij", lens_columns / scale, lens_columns / scale)
+        pull = np.concatenate([lens_columns[:, axis].T @ each for axis in (0, 1)], axis=1)
         instead = np.linalg.pinv(inner, hermitian=True) @ (pull / scale[:, None])
         return replace(self, instead=instead / scale[:, None])
 

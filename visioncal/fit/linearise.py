@@ -207,9 +207,9 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     if pair.corners:
         distances = pair.distances(at.poses)
         rows = corner_rows(unknowns, state, pair, at.poses, pair.twists(at.by_effects))
-        parts, own = _corner_parts(unknowns, pair, rows), rows.own
+        parts, local_columns = _corner_parts(unknowns, pair, rows), rows.local_columns
     else:
-        parts, own = _measured_parts(unknowns, state, pair, at.poses)
+        parts, local_columns = _measured_parts(unknowns, state, pair, at.poses)
     seer, _ = pair.names
     frames = [step.frame for step in pair.path]
     flanges = tuple(name for name in unknowns.erring if name in frames)
@@ -226,14 +226,14 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
             columns.append(known)
         elif effect.frame == seer and pair.corners and not isinstance(effect, Rolling):
             key: Key = ("effect", effect.name)
-            first = int(own[("lens", seer) if effect.place == "lens" else key][0])
+            first = int(local_columns[("lens", seer) if effect.place == "lens" else key][0])
             inner.append((first, effect.columns(pair.moments, distances)))
             of_inner[key] = known
     columns += of_inner.values()
     moves = np.concatenate([np.zeros((len(pair.rows), 6, 0)), *by_pose], axis=2)
     for first, by_local in inner:
         moves = _beside(moves, first, by_local)
-    free = {key: at for key, at in own.items() if key in unknowns and key not in of_inner}
+    free = {key: at for key, at in local_columns.items() if key in unknowns and key not in of_inner}
     kept = {key: places[: unknowns[key].count] for key, places in free.items()}
     columns += [unknowns.columns(*key)[: len(places)] for key, places in kept.items()]
     places = np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64)
@@ -243,7 +243,7 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     instead = unknowns.fields[seer].instead if ("field", seer) in kept else None
     if instead is not None:
         # A field's columns are last.
-        fixed[own["lens", seer], -instead.shape[1] :] = -instead
+        fixed[local_columns["lens", seer], -instead.shape[1] :] = -instead
     return Gram(
         pair.names, pair.rows, pair.stops, pair.moments, distances, parts, flanges, moves, fixed,
         np.concatenate([np.zeros(0, int), *columns]), at.poses, at.by_effects,
@@ -269,7 +269,7 @@ def _corner_parts(unknowns: Unknowns, pair: Pair, rows: "CornerRows") -> tuple[P
     by_axis = [np.swapaxes(padded(rows.head[:, axis]), 1, 2) for axis in (0, 1)]
     functions, residual = padded(rows.functions), padded(rows.residual)
     pulls = np.swapaxes(residual, 1, 2) @ functions
-    heads = [left @ np.swapaxes(left, 1, 2), *(own @ functions for own in by_axis)]
+    heads = [left @ np.swapaxes(left, 1, 2), *(axis_head @ functions for axis_head in by_axis)]
     heads.append(left @ residual.reshape(len(counts), -1, 1))
     products = Products(
         px, counts, np.concatenate(heads, axis=2), np.swapaxes(functions, 1, 2) @ functions,
@@ -280,13 +280,13 @@ def _corner_parts(unknowns: Unknowns, pair: Pair, rows: "CornerRows") -> tuple[P
         return (products,)
     root = np.linalg.cholesky(of_pose_alone(products.heads))
     by_pose = np.swapaxes(root, 1, 2) @ products.heads[:, :6]
-    own = np.swapaxes(by_pose[:, :, :head], 1, 2) @ by_pose
+    explained = np.swapaxes(by_pose[:, :, :head], 1, 2) @ by_pose
     posed, last = by_pose[:, :, head:-1], by_pose[:, :, -1]
     of_poses = Products(
-        view, np.full(len(counts), 6.0), own, np.zeros_like(products.functions),
+        view, np.full(len(counts), 6.0), explained, np.zeros_like(products.functions),
         np.einsum("kar,ka->kr", posed, last), np.sum(last**2, axis=1), posed,
     )  # fmt: skip
-    within = products.heads - own
+    within = products.heads - explained
     # But for rounding, these are zero: noise within a view is orthogonal to its pose.
     within[:, :6], within[:, :, :6] = 0.0, 0.0
     rest = replace(
@@ -316,7 +316,7 @@ class CornerRows:
     head: FloatArray  # (n, 2, h) by pose, lens, board, delay and motion of the image's rows.
     functions: FloatArray  # (n, r) by a field, along either axis.
     residual: FloatArray  # (n, 2).
-    own: dict[Key, IntArray]  # Local columns of what is a sighting's own.
+    local_columns: dict[Key, IntArray]  # Local columns of unknowns of one sighting.
 
     @property
     def count(self) -> int:
@@ -341,9 +341,9 @@ def corner_rows(
     }
     for key, moved in delays.items():
         points = apply_each(exp(state.values[key] * moved), points)
-    own = poses[pair.owner]
-    found = project_with_jacobian(lens, apply_each(own, points))
-    by_point = found.jacobian_point @ own[:, :3, :3]
+    corner_poses = poses[pair.owner]
+    found = project_with_jacobian(lens, apply_each(corner_poses, points))
+    by_point = found.jacobian_point @ corner_poses[:, :3, :3]
     columns: dict[Key, FloatArray] = {
         ("lens", seer): found.jacobian_intrinsics,
         ("shape", seen): by_point @ basis,
@@ -358,8 +358,8 @@ def corner_rows(
         if isinstance(effect, RowMotion):
             by_own = columns["effect", effect.name] = effect.shifts(pair.px)
         if isinstance(effect, Displacement):
-            seen_at = apply_each(own, points)
-            by_own = found.jacobian_point @ effect.moved(seen_at, own)
+            seen_at = apply_each(corner_poses, points)
+            by_own = found.jacobian_point @ effect.moved(seen_at, corner_poses)
             columns["effect", effect.name] = by_own
         columns_of = effect.columns(pair.moments, pair.distances(poses))
         moved = columns_of @ state.values["effect", effect.name]
@@ -422,8 +422,8 @@ def _measured_parts(
             for name, sigma, at in zip(("rad", "m"), sigmas, (0, 3), strict=True)
         ]
     parts = []
-    for name, own in noises:
-        part = rows[:, own]
+    for name, part_columns in noises:
+        part = rows[:, part_columns]
         grams = np.swapaxes(part, 1, 2) @ part
         index = unknowns.size_of(f"{name} {seer}") if name else -1
         counts, squares = 1.0 * part.any(axis=2).sum(axis=1), grams[:, -1, -1]

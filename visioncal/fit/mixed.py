@@ -69,8 +69,8 @@ class Body:
 class Eliminated:
     """The errors of one body, at given common unknowns."""
 
-    own: FloatArray  # (u, m, m) their covariance.
-    response: FloatArray  # (u, m, c) their derivative by the body's columns.
+    covariance: FloatArray  # (u, m, m) of the errors.
+    response: FloatArray  # (u, m, c) derivative of the errors by the body's columns.
     errors: FloatArray  # (u, m) at the estimate.
 
 
@@ -143,11 +143,11 @@ class Mixed:
         values = covariance @ common[:p, p]
         value += float(common[p, p] - common[:p, p] @ values) + log_det
         eliminated = []
-        for body, (_, cross), own in zip(self.bodies, units, inner, strict=True):
-            by = own @ cross
+        for body, (_, cross), error_covariance in zip(self.bodies, units, inner, strict=True):
+            by = error_covariance @ cross
             response = -by[:, :, :-1]
             solved = by[:, :, -1] + response @ values[body.columns]
-            eliminated.append(Eliminated(own, response, solved))
+            eliminated.append(Eliminated(error_covariance, response, solved))
         none = np.zeros(self.sizes)
         found = Estimate(
             logs, float(value), values, covariance, tuple(eliminated), none, np.diag(none)
@@ -175,8 +175,10 @@ class Mixed:
             c = body.columns
             flat = by.response.reshape(-1, len(c)) @ found.covariance[c[:, None], c]
             spreads.append(flat.reshape(by.response.shape))
-            insides.append(by.own + spreads[-1] @ np.swapaxes(by.response, 1, 2))
-        at_errors = [np.zeros((self.sizes, *own.errors.shape)) for own in found.bodies]
+            insides.append(by.covariance + spreads[-1] @ np.swapaxes(by.response, 1, 2))
+        at_errors = [
+            np.zeros((self.sizes, *eliminated.errors.shape)) for eliminated in found.bodies
+        ]
         for term in self.terms:
             if term.size < 0:
                 continue
@@ -186,12 +188,12 @@ class Mixed:
             some = found.covariance[term.columns[:, None], term.columns]
             absorbed = float(np.sum(term.common[:-1, :-1] * some))
             for part in term.parts:
-                e, own = found.bodies[part.body].errors, self.places[part.body][part.columns]
+                e, places = found.bodies[part.body].errors, self.places[part.body][part.columns]
                 by_error = (part.errors @ e[:, :, None])[:, :, 0]
                 by_common = part.cross @ np.append(found.values[part.columns], -1.0)
                 square += float(np.sum(e * (by_error + 2.0 * by_common)))
                 absorbed += float(np.sum(part.errors * insides[part.body]))
-                spread = spreads[part.body][:, :, own]
+                spread = spreads[part.body][:, :, places]
                 absorbed += 2.0 * float(np.sum(part.cross[:, :, :-1] * spread))
                 at_errors[part.body][term.size] += by_error + by_common
                 pulls[term.size, part.columns] += np.einsum("umc,um->c", part.cross[:, :, :-1], e)
@@ -201,7 +203,7 @@ class Mixed:
             diagonal[term.size] += 2.0 * (weight * (square - absorbed) + term.count)
         for body, by, each in zip(self.bodies, found.bodies, at_errors, strict=True):
             flat = each.reshape(self.sizes, -1)
-            solved = (by.own @ each[:, :, :, None])[:, :, :, 0].reshape(self.sizes, -1)
+            solved = (by.covariance @ each[:, :, :, None])[:, :, :, 0].reshape(self.sizes, -1)
             inner += flat @ solved.T
             pulls[:, body.columns] += np.tensordot(each, by.response, axes=([1, 2], [0, 1]))
         inner += pulls @ found.covariance @ pulls.T
@@ -271,11 +273,11 @@ def summed(terms: Sequence[Term], bodies: Sequence[Body]) -> Term:
         common[at[:, None], at] += term.common
     parts = []
     for body in sorted({part.body for term in terms for part in term.parts}):
-        own = [part for term in terms for part in term.parts if part.body == body]
-        union = np.unique(np.concatenate([part.columns for part in own]))
+        body_parts = [part for term in terms for part in term.parts if part.body == body]
+        union = np.unique(np.concatenate([part.columns for part in body_parts]))
         units, width = len(bodies[body].stops), bodies[body].width
         errors, cross = np.zeros((units, width, width)), np.zeros((units, width, len(union) + 1))
-        for part in own:
+        for part in body_parts:
             at = np.append(np.searchsorted(union, part.columns), len(union))
             if part.units is None or len(part.units) == units:
                 errors += part.errors

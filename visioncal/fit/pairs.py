@@ -108,7 +108,9 @@ def pairs_of(cell: Cell, most: int = 50) -> tuple[Pair, ...]:
         for index in indices:
             sighting = cell.sightings[index]
             kinds.setdefault((type(sighting.evidence), sighting.is_stated), []).append(index)
-        parts = [own[at : at + most] for own in kinds.values() for at in range(0, len(own), most)]
+        parts = [
+            group[at : at + most] for group in kinds.values() for at in range(0, len(group), most)
+        ]
         for rows in parts:
             stops = np.array([cell.sightings[row].stop for row in rows])
             board = cell.boards.get(names[1])

@@ -59,17 +59,17 @@ class Considered:
 
 def consider(fit: Fit, flange: str) -> Considered | None:
     """The changes by lasting errors of one arm; None where too few stops show any."""
-    alone = _alone(fit, flange)
-    if alone is None:
+    by_stop = _errors_by_stop(fit, flange)
+    if by_stop is None:
         return None
-    stops, p = len(alone.stops), fit.unknowns.count
+    stops, p = len(by_stop.stops), fit.unknowns.count
     boards, logs, free = _boards(fit), list[float](), list[float]()
     usual, off = list[float](), list[FloatArray]()
     levels = list[tuple[Process | None, float, float]]()
 
-    grid, beside = _grid_of(fit, flange, alone, creeps=True)
+    grid, at_stops = _grid_of(fit, flange, by_stop, creeps=True)
 
-    weighed = partial(_in_all_ways, beside=beside, boards=boards)
+    weighed = partial(_in_all_ways, at_stops=at_stops, boards=boards)
     # Without boards, all are as stated.
     ways = [*enumerate(_LOOSE.values(), 1)] if boards else [(0, 1.0)]
     for tried, found in _climb(grid, weighed, _logs_of):
@@ -87,20 +87,20 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         if process is not None:
             by_process.setdefault(process, []).append((share, (process, size, white)))
     # The estimate's response to an error at each stop, which it takes for independent.
-    gains = np.linalg.inv(alone.known + alone.independent) @ alone.rows[:, :, :p]
-    independent = np.einsum("uia,uij,ujb->ab", gains, alone.independent, gains, optimize=True)
+    gains = np.linalg.inv(by_stop.known + by_stop.independent) @ by_stop.rows[:, :, :p]
+    independent = np.einsum("uia,uij,ujb->ab", gains, by_stop.independent, gains, optimize=True)
     known, excess, shift = fit.estimate.covariance, np.zeros((p, p)), np.zeros(p)
     added = np.zeros((p, p))
     moved = list[tuple[float, FloatArray]]()
-    for process, own in by_process.items():
-        share = sum(share for share, _ in own)
+    for process, weighted in by_process.items():
+        share = sum(share for share, _ in weighted)
         if process.is_of_time and share > _SHARE and stops <= _AVERAGED:
             # The likeliest size of a process stands for all of its sizes where it is estimated.
-            values, covariance = _estimated(alone, *max(own, key=lambda one: one[0])[1])
+            values, covariance = _estimated(by_stop, *max(weighted, key=lambda one: one[0])[1])
             moved.append((share, values - fit.estimate.values))
             excess += share * (covariance - known)
             continue
-        shown = [one for one in own if one[0] > _LITTLE]
+        shown = [one for one in weighted if one[0] > _LITTLE]
         squares = sum(share * size**2 for share, (_, size, _) in shown)
         missing = sum(share * (1.0 - white**2) for share, (*_, white) in shown)
         if shown:
@@ -109,16 +109,16 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     for share, away in moved:
         shift += share * away
         excess += share * np.outer(away, away)
-    excess += _of_frames(fit, flange, alone, gains)
+    excess += _of_frames(fit, flange, by_stop, gains)
     by_board = dict(zip(held_boards(fit), mean_squares.tolist(), strict=True))
     return Considered(shift, excess - np.outer(shift, shift), odds, by_board)
 
 
 def _in_all_ways(
-    one: "Tried", beside: Callable[["Tried"], "Tried"], boards: Sequence["_Board"]
+    one: "Tried", at_stops: Callable[["Tried"], "Tried"], boards: Sequence["_Board"]
 ) -> "tuple[Tried, list[Judged]]":
     """A trial given the stops, judged with boards as stated, and with boards of any size."""
-    seen, sizes = beside(one), (0.0, *_LOOSE) if boards else (0.0,)
+    seen, sizes = at_stops(one), (0.0, *_LOOSE) if boards else (0.0,)
     return seen, [judged(seen, boards, size) for size in sizes]
 
 
@@ -126,18 +126,18 @@ def _logs_of(weighed: "tuple[Tried, list[Judged]]") -> FloatArray:
     return np.array([weighed[0].prior + way[0] for way in weighed[1]])
 
 
-def _of_frames(fit: Fit, flange: str, alone: StopErrors, gains: FloatArray) -> FloatArray:
+def _of_frames(fit: Fit, flange: str, by_stop: StopErrors, gains: FloatArray) -> FloatArray:
     """(p, p) covariance by the postures of the stops, to whose mean effects of posture refer."""
     p, frames = fit.unknowns.count, np.zeros((12, 12))
     for effect in fit.unknowns.effects:
         if isinstance(effect, PostureEffect) and effect.frame == flange:
-            own, values = fit.unknowns.columns("effect", effect.name), fit.state.values
+            columns, values = fit.unknowns.columns("effect", effect.name), fit.state.values
             found = values["effect", effect.name]
-            square = fit.estimate.covariance[own[:, None], own] + np.outer(found, found)
+            square = fit.estimate.covariance[columns[:, None], columns] + np.outer(found, found)
             frames += effect.covariance_of_frames(square)
     if not frames.any():
         return np.zeros((p, p))
-    twists = twists_of_frames(fit.cell.arms[flange].poses[alone.stops])
+    twists = twists_of_frames(fit.cell.arms[flange].poses[by_stop.stops])
     moved = fit.estimate.covariance @ np.einsum("uia,uib->ab", gains, twists)
     return np.asarray(moved @ frames @ moved.T)
 
@@ -158,31 +158,31 @@ def scored(
     # (g, c) columns of effects with c unknowns each, and which ones they are.
     ends = np.cumsum(counts)
     groups = [
-        (ends[own][:, None] - np.arange(count, 0, -1), own) for count, own in by_count.items()
+        (ends[same][:, None] - np.arange(count, 0, -1), same) for count, same in by_count.items()
     ]
     columns = [products(fit, added, effect.count) for effect, added in effects]
-    alone, boards = _alone(fit, flange, columns), _boards(fit)
-    if alone is None:
+    by_stop, boards = _errors_by_stop(fit, flange, columns), _boards(fit)
+    if by_stop is None:
         return []
     sizes, ways = np.geomspace(1e-6, 0.1, 31), {0.0: 1.0}
     if boards:
         # One board of twenty is of another size.
         ways = {0.0: 0.95, **{off: 0.05 * share for off, share in _LOOSE.items()}}
     shares = np.log([*ways.values()])
-    grid, beside = _grid_of(fit, flange, alone, creeps=False)
+    grid, at_stops = _grid_of(fit, flange, by_stop, creeps=False)
 
     def weighed(one: Tried) -> tuple[FloatArray, FloatArray]:
         """Evidence (w,) with boards in w ways, and what e effects gain by size (2, w, e, 31)."""
-        seen = beside(one)
+        seen = at_stops(one)
         found = [judged(seen, boards, off) for off in ways]
         taken = np.array([pull for _, pull, _ in found])
         whole = seen.total[len(seen.boards) :, len(seen.boards) :]
         gains = np.empty((2, len(ways), len(effects), len(sizes)))
-        for at, own in groups:
+        for at, same in groups:
             part = taken[:, :, at].transpose(0, 2, 3, 1)
             information = whole[at[:, :, None], at[:, None, :]] - part @ np.swapaxes(part, 2, 3)
             pull = whole[at, -1] - (part @ taken[:, None, :, -1:])[..., 0]
-            gains[:, :, own] = Score(pull, information, np.inf).gains(sizes)
+            gains[:, :, same] = Score(pull, information, np.inf).gains(sizes)
         return seen.prior + shares + [value for value, *_ in found], gains
 
     def logs_of(each: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -205,20 +205,20 @@ def scored(
 
 
 def _grid_of(
-    fit: Fit, flange: str, alone: StopErrors, *, creeps: bool
+    fit: Fit, flange: str, by_stop: StopErrors, *, creeps: bool
 ) -> tuple[Iterator[Tried], Callable[[Tried], Tried]]:
-    """Processes over the stops, each of all sizes, before these are seen; the same beside them.
+    """Processes over the stops, each of all sizes, before the stops are seen; the same at them.
 
     Independent errors of all levels come first.
     """
-    levels, poses = fit.flange_sigmas(flange), fit.cell.arms[flange].poses[alone.stops]
+    levels, poses = fit.flange_sigmas(flange), fit.cell.arms[flange].poses[by_stop.stops]
     boards = np.eye(fit.unknowns.count)[:, [board.column for board in _boards(fit)]]
-    some = evenly(len(alone.stops), _MOST)
+    some = evenly(len(by_stop.stops), _MOST)
     kinds = tuple(processes(poses, levels, creeps=creeps))
-    shared = Shared.of(alone, some, kinds)
-    rows, rest, by_boards = _combined(alone, some, shared.independent[1.0], boards)
+    shared = Shared.of(by_stop, some, kinds)
+    rows, rest, by_boards = _combined(by_stop, some, shared.independent[1.0], boards)
     rows = np.asfortranarray(rows)
-    return _grid(kinds, SIZES, rest, by_boards), lambda one: one.beside(rows, shared)
+    return _grid(kinds, SIZES, rest, by_boards), lambda one: one.with_stops(rows, shared)
 
 
 def _climb(
@@ -270,21 +270,21 @@ def _grid(
 
 
 def weigh(
-    alone: StopErrors, poses: FloatArray, kinds: Sequence[Process]
+    by_stop: StopErrors, poses: FloatArray, kinds: Sequence[Process]
 ) -> list[tuple[Tried, float]]:
     """Processes over (s, 4, 4) stops, and independent errors alone, with their evidence.
 
-    It is the logarithm of prior and restricted likelihood, over that of independent errors. Many
-    stops form groups, which are independent beside the common unknowns (Quinonero-Candela and
-    Rasmussen 2005, section 6): those next to each other for what is of time, and those of similar
-    postures else.
+    The evidence is the logarithm of prior and restricted likelihood, over that of independent
+    errors. Many stops form groups, which are independent beside the common unknowns
+    (Quinonero-Candela and Rasmussen 2005, section 6): those next to each other for what is of
+    time, and those of similar postures else.
     """
-    stops = np.arange(len(alone.stops))
+    stops = np.arange(len(by_stop.stops))
     count = -(-len(stops) // _MOST)
     near = [kind for kind in kinds if kind.is_of_time and not kind.is_creep]
-    in_time = _by_groups(alone, near, np.array_split(stops, count))
+    in_time = _by_groups(by_stop, near, np.array_split(stops, count))
     rest = [kind for kind in kinds if kind not in near]
-    others = _by_groups(alone, rest, _similar(posture_features(poses), count))
+    others = _by_groups(by_stop, rest, _similar(posture_features(poses), count))
     return [*others, *(pair for pair in in_time if pair[0].process is not None)]
 
 
@@ -299,15 +299,15 @@ def _similar(features: FloatArray, count: int) -> list[IntArray]:
 
 
 def _by_groups(
-    alone: StopErrors, kinds: Sequence[Process], groups: Sequence[IntArray]
+    by_stop: StopErrors, kinds: Sequence[Process], groups: Sequence[IntArray]
 ) -> list[tuple[Tried, float]]:
     """Trials by groups of stops; one that a group excludes is not tried on others."""
-    # Most arms have next to none.
-    grid = [*_grid(kinds, (0.1, *SIZES), alone.rest, np.zeros((alone.count, 0)))]
+    # Most arms have next to no lasting errors.
+    grid = [*_grid(kinds, (0.1, *SIZES), by_stop.rest, np.zeros((by_stop.count, 0)))]
     left = [(one, 0.0) for one in grid]
     for at, group in enumerate(groups, 1):
-        rows = np.asfortranarray(alone.rows[group].reshape(-1, alone.count + 1))
-        shared = Shared.of(alone, group, {one.process for one, _ in left if one.process})
+        rows = np.asfortranarray(by_stop.rows[group].reshape(-1, by_stop.count + 1))
+        shared = Shared.of(by_stop, group, {one.process for one, _ in left if one.process})
         weighed = partial(_evidence, rows=rows, shared=shared)
         # Further groups may change what is far.
         far = _FAR if at == len(groups) else np.inf
@@ -323,12 +323,12 @@ def _by_groups(
 
 def _evidence(one: Tried, rows: FloatArray, shared: "Shared") -> tuple[Tried, float]:
     """A trial given more stops, and the logarithm of its evidence, with boards as stated."""
-    seen = one.beside(rows, shared)
+    seen = one.with_stops(rows, shared)
     return seen, seen.prior + judged(seen, (), 0.0)[0]
 
 
 def _combined(
-    alone: StopErrors, some: IntArray, independent: FloatArray, boards: FloatArray
+    errors: StopErrors, some: IntArray, independent: FloatArray, boards: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rows (d k, r + c + 1), and all else, by those r combinations of p unknowns that they show.
 
@@ -338,7 +338,7 @@ def _combined(
     Returns:
         Both, and the (r, b) sizes of boards that are held by these combinations.
     """
-    p, rest, flat = alone.count, alone.rest, alone.rows[some].reshape(-1, alone.rows.shape[2])
+    p, rest, flat = errors.count, errors.rest, errors.rows[some].reshape(-1, errors.rows.shape[2])
     if p <= len(flat):
         return flat, rest, boards
     root = np.linalg.cholesky(independent)
@@ -362,19 +362,19 @@ def _combined(
 
 
 def _estimated(
-    alone: StopErrors, process: Process, size: float, white: float
+    by_stop: StopErrors, process: Process, size: float, white: float
 ) -> tuple[FloatArray, FloatArray]:
     """The (p,) estimate under a process, and its covariance (p, p)."""
-    every, p = np.arange(len(alone.stops)), alone.rows.shape[2] - 1
-    covariance = alone.covariance(every, white) + size**2 * process.covariance(every)
+    every, p = np.arange(len(by_stop.stops)), by_stop.rows.shape[2] - 1
+    covariance = by_stop.covariance(every, white) + size**2 * process.covariance(every)
     root = np.linalg.cholesky(covariance)
-    solved = np.linalg.solve(root, alone.rows.reshape(-1, p + 1))
-    total = solved.T @ solved + alone.rest
+    solved = np.linalg.solve(root, by_stop.rows.reshape(-1, p + 1))
+    total = solved.T @ solved + by_stop.rest
     found, _ = inverse(total[:p, :p])
     return found @ total[:p, p], found
 
 
-def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> StopErrors | None:
+def _errors_by_stop(fit: Fit, flange: str, added: Sequence[Products] = ()) -> StopErrors | None:
     """Residuals of each stop alone; None of too few stops.
 
     Args:
@@ -386,8 +386,8 @@ def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> StopErrors 
     if at < 0:
         return None
     body, p = fit.mixed.bodies[at], fit.unknowns.count
-    own = body.errors_of((flange,))
-    others = np.setdiff1d(np.arange(body.width), own)
+    places = body.errors_of((flange,))
+    others = np.setdiff1d(np.arange(body.width), places)
     levels = fit.flange_sigmas(flange)
     units, rest = _beside(*fit.mixed.assembled(fit.estimate.logs), added)
     p, more = len(rest) - 1, np.arange(p, len(rest))
@@ -398,15 +398,15 @@ def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> StopErrors 
             solved = np.linalg.solve(errors, cross)
             rest[columns[:, None], columns] -= np.einsum("uma,umb->ab", cross, solved)
     errors, cross = units[at]
-    errors[:, own, own] -= levels**-2.0
-    cross[:, own, -1] += past * levels**-2.0
+    errors[:, places, places] -= levels**-2.0
+    cross[:, places, -1] += past * levels**-2.0
     columns = np.append(body.columns, more)
     if len(others):
-        inner, between = errors[:, others[:, None], others], errors[:, own[:, None], others]
+        inner, between = errors[:, others[:, None], others], errors[:, places[:, None], others]
         solved = np.linalg.solve(inner, cross[:, others])
         rest[columns[:, None], columns] -= np.einsum("uma,umb->ab", cross[:, others], solved)
-        cross = cross[:, own] - between @ solved
-        errors = errors[:, own[:, None], own] - between @ np.linalg.solve(
+        cross = cross[:, places] - between @ solved
+        errors = errors[:, places[:, None], places] - between @ np.linalg.solve(
             inner, np.swapaxes(between, 1, 2)
         )
     seen = np.flatnonzero(np.linalg.eigvalsh(errors)[:, 0] * levels.min() ** 2 > 1e-6)
@@ -435,7 +435,7 @@ def _beside(
         rest = np.block(
             [
                 [rest[:-1, :-1], common, rest[:-1, -1:]],
-                [common.T, one.own, pull],
+                [common.T, one.inner, pull],
                 [rest[-1:, :-1], pull.T, rest[-1:, -1:]],
             ]
         )

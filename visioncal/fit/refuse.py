@@ -55,12 +55,14 @@ def refuse_open(fit: Fit) -> None:
     logs = np.where(flanges, level, np.where(corners, least, fit.estimate.logs))
     by_motion = _of_edges(fit, logs)
     logs = np.where(flanges | corners, least, fit.estimate.logs)
-    beside = fit.mixed.at(logs, is_sloped=False).covariance
-    for covariance, is_by_motion in ((by_motion, True), (beside, False)):
+    joint_covariance = fit.mixed.at(logs, is_sloped=False).covariance
+    for covariance, is_by_motion in ((by_motion, True), (joint_covariance, False)):
         for name in fit.cell.unknown:
-            own = fit.unknowns.columns("edge", name)
+            columns = fit.unknowns.columns("edge", name)
             parent = fit.cell.tree.branches[name].parent
-            for one in edge_directions(fit.edge(name), covariance[np.ix_(own, own)], name, parent):
+            for one in edge_directions(
+                fit.edge(name), covariance[np.ix_(columns, columns)], name, parent
+            ):
                 if one.is_open or (is_by_motion and one.sigma > one.limit):
                     raise DegenerateError(
                         f"cell: {one.words} {one.fault(' at a typical noise')}.",

@@ -36,7 +36,7 @@ class Added:
 
     gram: Gram
     local: FloatArray  # (k, c, d + 1) products with the sightings' local columns and residual.
-    own: FloatArray  # (c, c) of the columns with each other, summed over the sightings.
+    inner: FloatArray  # (c, c) of the columns with each other, summed over the sightings.
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,13 +115,13 @@ def _best_of_many(
     student: Callable[[float], FloatArray],
 ) -> tuple[float, float]:
     """The same as `Score.best` by a tridiagonal matrix: half the time of eigenvectors."""
-    lower, diagonal, beside, reflectors, _ = lapack.dsytrd(information, lower=1)
+    lower, diagonal, off_diagonal, reflectors, _ = lapack.dsytrd(information, lower=1)
     turned, _, _ = lapack.dormqr("L", "T", lower[1:, :-1], reflectors, pull[1:, None], 64)
     pull = np.append(pull[:1], turned)
-    (most,) = eigvalsh_tridiagonal(diagonal, beside, "i", (len(pull) - 1, len(pull) - 1))
+    (most,) = eigvalsh_tridiagonal(diagonal, off_diagonal, "i", (len(pull) - 1, len(pull) - 1))
     sizes, gains = _sizes_of(float(most), low, high), list[float]()
     for square in np.square(sizes).tolist():
-        pivots, factors, _ = lapack.dpttrf(1.0 + square * diagonal, square * beside)
+        pivots, factors, _ = lapack.dpttrf(1.0 + square * diagonal, square * off_diagonal)
         solved, _ = lapack.dpttrs(pivots, factors, pull)
         gains.append(float(student(square * float(pull @ solved))) - np.log(pivots).sum() / 2.0)
     best = int(np.argmax(gains))
@@ -133,7 +133,7 @@ class Products:
     """Weighted products of c more columns with all rows."""
 
     pull: FloatArray  # (c,) with the residuals.
-    own: FloatArray  # (c, c) with each other.
+    inner: FloatArray  # (c, c) with each other.
     common: FloatArray  # (p, c) with the unknowns.
     errors: list[FloatArray]  # (u, m, c) with the errors of each body's units.
 
@@ -141,35 +141,35 @@ class Products:
 def products(fit: Fit, added: Iterable[Added], count: int) -> Products:
     """Weighted products of `count` more columns with all rows."""
     p = fit.unknowns.count
-    pull, own, with_common = np.zeros(count), np.zeros((count, count)), np.zeros((p, count))
+    pull, inner, with_common = np.zeros(count), np.zeros((count, count)), np.zeros((p, count))
     with_errors = [np.zeros((len(body.stops), body.width, count)) for body in fit.mixed.bodies]
     for part in added:
         gram, f = part.gram, 6 * len(part.gram.flanges)
         full = np.swapaxes(gram.by_unknowns(part.local[:, :, :-1]), 1, 2)
         pull += part.local[:, :, -1].sum(axis=0)
-        own += part.own
+        inner += part.inner
         np.add.at(with_common, gram.columns, full[:, f:].sum(axis=0))
         if f:
             at = body_with(fit.mixed.bodies, gram.flanges)
             body = fit.mixed.bodies[at]
             units = np.searchsorted(body.stops, gram.stops)
             np.add.at(with_errors[at], (units[:, None], body.errors_of(gram.flanges)), full[:, :f])
-    return Products(pull, own, with_common, with_errors)
+    return Products(pull, inner, with_common, with_errors)
 
 
 def score(fit: Fit, added: Iterable[Added], count: int, freedom: float) -> Score:
     """The score of `count` more columns, on rows whose noise is known by so many residuals."""
     with_rows, estimate = products(fit, added, count), fit.estimate
-    pull, own = with_rows.pull - with_rows.common.T @ estimate.values, with_rows.own
+    pull, inner = with_rows.pull - with_rows.common.T @ estimate.values, with_rows.inner
     reduced = with_rows.common
     for body, solved, cross in zip(
         fit.mixed.bodies, estimate.bodies, with_rows.errors, strict=True
     ):
         pull -= np.einsum("umc,um->c", cross, solved.errors)
         flat = cross.reshape(-1, count)
-        own -= flat.T @ (solved.own @ cross).reshape(-1, count)
+        inner -= flat.T @ (solved.covariance @ cross).reshape(-1, count)
         reduced[body.columns] += solved.response.reshape(len(flat), -1).T @ flat
-    information = own - reduced.T @ estimate.covariance @ reduced
+    information = inner - reduced.T @ estimate.covariance @ reduced
     return Score(pull, (information + information.T) / 2, freedom)
 
 
@@ -197,8 +197,8 @@ def added_by(fit: Fit, effect: Effect, pairs: Sequence[Pair] = ()) -> list[Added
             continue
         rows = slice(first, first + moves.shape[1])
         local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)[:, rows]
-        own = np.tensordot(local[:, :, rows], moves, ((0, 2), (0, 1)))
-        added.append(Added(gram, local, own))
+        inner = np.tensordot(local[:, :, rows], moves, ((0, 2), (0, 1)))
+        added.append(Added(gram, local, inner))
     return added
 
 
@@ -207,9 +207,9 @@ def of_rows(fit: Fit, pairs: Sequence[Pair], motion: RowMotion) -> Score:
 
     The part of it that lens and board may absorb counts as if they did.
     """
-    count, own = len(motion.stops), images_of(pairs, motion.frame)
+    count, images = len(motion.stops), images_of(pairs, motion.frame)
     pull, information = np.zeros((count, 4)), np.zeros((count, 4, 4))
-    for gram, pair, rows in _of_images(fit, own):
+    for gram, pair, rows in _of_images(fit, images):
         kept = np.flatnonzero(fit.used[gram.rows] & np.isin(gram.stops, motion.stops))
         if not len(kept):
             continue
@@ -238,14 +238,14 @@ def best_displacement(
     found = score(fit, added_by_displacements(fit, pairs, tried), count, fit.of_corners)
     # The thickness of a pane is positive.
     pull = np.where(found.pull > 0.0, found.pull, 0.0) if tried[0].is_positive else found.pull
-    alone = [
+    single_bests = [
         Score(pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
             np.ones(1), *tried[at].bounds[1:]
         )
         for at in range(count)
     ]
-    best = max(range(count), key=lambda at: alone[at][1])
-    return tried[best], alone[best][0], alone[best][1] - float(np.log(count))
+    best = max(range(count), key=lambda at: single_bests[at][1])
+    return tried[best], single_bests[best][0], single_bests[best][1] - float(np.log(count))
 
 
 def added_by_displacements(
@@ -301,10 +301,10 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
     return score(fit, added, 2 * len(orders_of_waves()), fit.of_corners)
 
 
-def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
+def _by_waves(fit: Fit, images: Sequence[Pair], camera: str) -> Iterator[Added]:
     """The waves' columns, of some images at a time: those of all would fill the memory."""
     orders, width = orders_of_waves(), float(fit.unknowns.lenses[camera].resolution[0])
-    for gram, pair, rows in _of_images(fit, own):
+    for gram, pair, rows in _of_images(fit, images):
         kept = fit.used[gram.rows]
         predicted = pair.px - rows.residual / pair.weights[:, None]
         each = waves(predicted, width, orders) * pair.weights[:, None]
@@ -318,10 +318,10 @@ def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
         yield _beside_poses(fit, taken, local, product)
 
 
-def _of_images(fit: Fit, own: Sequence[Pair]) -> Iterator[tuple[Gram, Pair, CornerRows]]:
+def _of_images(fit: Fit, images: Sequence[Pair]) -> Iterator[tuple[Gram, Pair, CornerRows]]:
     """The rows of the corners of some images, of which the fit uses any."""
     for gram in fit.grams:
-        pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
+        pair = next((one for one in images if np.array_equal(one.rows, gram.rows)), None)
         if pair is not None and fit.used[gram.rows].any():
             twists = pair.twists(gram.by_effects)
             yield gram, pair, corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)

@@ -274,8 +274,10 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
     noise, ratios = list(flange_noise(erring)), [(f"rad {name}", f"m {name}") for name in erring]
     compared = _compared(cell)
     for name in start.lenses:
-        own = [s.corners for s in cell.sightings if s.seer == name and s.corners is not None]
-        if any(corners.stated_px is None for corners in own):
+        corner_sets = [
+            s.corners for s in cell.sightings if s.seer == name and s.corners is not None
+        ]
+        if any(corners.stated_px is None for corners in corner_sets):
             noise.append(Size(f"px {name}", 0.3, 1e-4, 30.0))
             if name in compared:
                 noise.append(Size(f"view {name}", 0.3, 1e-4, 30.0))
@@ -331,8 +333,8 @@ def _compared(cell: Cell) -> set[str]:
     for sighting in cell.sightings:
         if sighting.corners is not None:
             seers.setdefault(sighting.stop, []).append(sighting.seer)
-    beside = Counter(name for names in seers.values() if len(names) > 1 for name in set(names))
-    return {name for name, count in beside.items() if count >= ENOUGH_STOPS}
+    stop_counts = Counter(name for names in seers.values() if len(names) > 1 for name in set(names))
+    return {name for name, count in stop_counts.items() if count >= ENOUGH_STOPS}
 
 
 def _corners_px(cell: Cell, camera: str) -> FloatArray:

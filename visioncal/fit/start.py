@@ -106,15 +106,15 @@ def start_of(cell: Cell, lenses: Mapping[str, Camera] | None = None, early: floa
     cell, sound = cell.without(lost), sound[kept]
     known = [option for option in options if option is not None]
     # Sightings that are held out help no fit.
-    own = np.flatnonzero(~cell.held).tolist()
-    tied = _network(cell.only(own), [known[at] for at in own], early).connected()
+    free_rows = np.flatnonzero(~cell.held).tolist()
+    tied = _network(cell.only(free_rows), [known[at] for at in free_rows], early).connected()
     joined = [at for at, s in enumerate(cell.sightings) if tied.ties(*s.pair)]
     untied = {
         at: f"nothing ties {' or '.join(sighting.pair)} to the rest of the cell"
         for at, sighting in enumerate(cell.sightings)
         if at not in joined
     }
-    seen = [at for at in own if not cell.sightings[at].is_stated]
+    seen = [at for at in free_rows if not cell.sightings[at].is_stated]
     wrong = {cell.sightings[seen[at]].view for at in np.flatnonzero(tied.misplaced).tolist()}
     cell, known = cell.without(untied), [known[at] for at in joined]
     is_placed = [s.view not in wrong for s in cell.sightings]
@@ -222,8 +222,8 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
         trial = {frame: at(float(np.exp(log_focal)))}
         options = zip(cell.sightings, _options(cell, trial), strict=True)
         known = [(s, option) for s, option in options if option is not None]
-        own = cell.with_sightings([sighting for sighting, _ in known])
-        tied = _network(own, [found for _, found in known]).connected()
+        posed_cell = cell.with_sightings([sighting for sighting, _ in known])
+        tied = _network(posed_cell, [found for _, found in known]).connected()
         off = []
         for s, found in known:
             poses = {name: arm.poses[s.stop] for name, arm in cell.arms.items()}
@@ -257,8 +257,8 @@ def _options(cell: Cell, lenses: Mapping[str, Camera]) -> list[_Options | None]:
         elif isinstance(evidence, MeasuredPlace):
             option = _Options(compose(np.eye(3), evidence.place_m)[None], once)
         elif at in planes:
-            board, own = cell.boards[sighting.seen], turns[sighting.seen]
-            option = _of_corners(lenses[sighting.seer], board, own, evidence, planes[at])
+            board, board_turns = cell.boards[sighting.seen], turns[sighting.seen]
+            option = _of_corners(lenses[sighting.seer], board, board_turns, evidence, planes[at])
         else:
             option = None
         found.append(option)
@@ -299,7 +299,7 @@ def _network(cell: Cell, options: Sequence[_Options], early: float = 1.0) -> Net
         np.array([one.stop for one in rows]),
         np.array([not isinstance(one.evidence, MeasuredPlace) for one in rows]),
         Candidates.of([options[at].poses for at in seen], [options[at].turns for at in seen]),
-        {name: own for name, own in turns.items() if len(own) > 1},
+        {name: board_turns for name, board_turns in turns.items() if len(board_turns) > 1},
         tuple(one for one in found if one is not None),
         frozenset(name for pair, _ in stated for name in pair),
         early,

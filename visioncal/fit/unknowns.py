@@ -246,8 +246,8 @@ def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool
     if stated is not None:
         priors.append(Prior(np.arange(4), sigma=stated))
     if is_spare and table.intrinsics == "refine":
-        own = {prior.columns[0]: prior for prior in estimated_lens(frame, lens).priors}
-        priors += [prior for first, prior in own.items() if first >= count]
+        estimated_priors = {prior.columns[0]: prior for prior in estimated_lens(frame, lens).priors}
+        priors += [prior for first, prior in estimated_priors.items() if first >= count]
         count = len(values)
     elif is_spare and table.intrinsics == "auto":
         moved = np.sqrt(np.nanmean(by_lens(lens, px) ** 2, axis=(0, 1)) * 2.0)
@@ -281,10 +281,10 @@ def printed_board(frame: str, board: Target | None, *, has_shape: bool, is_sized
     else held.
     """
     share = board.square_sigma_m / board.square_m if board else DEFAULT_RELATIVE_SIGMA
-    share, own = max(share, 1e-7), np.arange(SHAPES)[SIZE]
+    share, size_columns = max(share, 1e-7), np.arange(SHAPES)[SIZE]
     # No corners and no arm show a millionth.
-    held = Prior(own, sigma=min(share, 1e-6), considered=share)
-    priors = [Prior(own, Size(f"scale {frame}", 0.01, share, 0.2)) if is_sized else held]
+    held = Prior(size_columns, sigma=min(share, 1e-6), considered=share)
+    priors = [Prior(size_columns, Size(f"scale {frame}", 0.01, share, 0.2)) if is_sized else held]
     if has_shape:
         for part, columns, bounds in (
             ("plane", PLANE, (3e-4, 1e-7, 0.02)),

@@ -66,15 +66,15 @@ def on_planes(cell: Cell, lenses: Mapping[str, Camera]) -> dict[int, FloatArray]
     """Corners (n, 2) of each image on the plane at unit depth, by row; a camera's all at once."""
     found = dict[int, FloatArray]()
     for camera, lens in lenses.items():
-        own = {
+        camera_px = {
             at: sighting.corners.px
             for at, sighting in enumerate(cell.sightings)
             if sighting.seer == camera and sighting.corners is not None
         }
-        if own:
-            plane = normalise(lens, np.concatenate([*own.values()]))
-            ends = np.cumsum([len(px) for px in own.values()])
-            found |= zip(own, np.split(plane, ends[:-1]), strict=True)
+        if camera_px:
+            plane = normalise(lens, np.concatenate([*camera_px.values()]))
+            ends = np.cumsum([len(px) for px in camera_px.values()])
+            found |= zip(camera_px, np.split(plane, ends[:-1]), strict=True)
     return found
 
 
@@ -118,9 +118,9 @@ def weighed(
         rows = corner_rows(unknowns, state, pair, seen.poses, pair.twists(seen.by_effects))
         by_pose = np.concatenate([rows.head[:, :, :6], rows.residual[:, :, None]], axis=2)
         each = np.split(by_pose, np.cumsum(pair.counts)[:-1])
-        for row, own, corners in zip(pair.rows.tolist(), each, pair.corners, strict=True):
+        for row, view_rows, corners in zip(pair.rows.tolist(), each, pair.corners, strict=True):
             if used[row]:
-                judged[row] = _by_own_pose(own * (corners.stated_px or 1.0))
+                judged[row] = _by_own_pose(view_rows * (corners.stated_px or 1.0))
     return _weighed(cell, judged)
 
 
@@ -178,8 +178,8 @@ def _weighed(cell: Cell, judged: Mapping[int, _Judged]) -> Weighed:
                 continue
             kept = corners.take(judged[row].agreeing)
             if weight != 1.0 and kept.stated_px is None:
-                own = 1.0 if kept.weights is None else kept.weights
-                kept = replace(kept, weights=own * np.full(len(kept.ids), weight))
+                kept_weights = 1.0 if kept.weights is None else kept.weights
+                kept = replace(kept, weights=kept_weights * np.full(len(kept.ids), weight))
             elif len(kept.ids) == len(corners.ids):
                 continue
             changed = True
