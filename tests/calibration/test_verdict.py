@@ -789,8 +789,8 @@ def without_arm_errors(known: RunState) -> RunState:
     """The same with an arm of which nothing but noise is known."""
     answer, solved = known.assessment, known.cell_fit
     arms = {name: replace(arm, errors=None) for name, arm in solved.arms.items()}
-    beside = {name: part for name, part in answer.fit.beside.items() if name != "arm"}
-    changed = replace(answer, fit=replace(answer.fit, beside=beside))
+    beside = {name: part for name, part in answer.fit.by_source.items() if name != "arm"}
+    changed = replace(answer, fit=replace(answer.fit, by_source=beside))
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
 
 
@@ -1113,7 +1113,7 @@ def test_an_error_that_an_arm_repeats_moves_no_pick() -> None:
         pose_basis(answer.fit.problem.poses[robot])[:, :, :12], 4e-3, 0.0, of_links=False
     )
     off = errors.sigma * answer.fit.bias(robot, errors)
-    fit = replace(answer.fit, beside={**answer.fit.beside, "arm": off @ off.T})
+    fit = replace(answer.fit, by_source={**answer.fit.by_source, "arm": off @ off.T})
     erring = replace(
         known,
         assessment_or_none=replace(answer, fit=fit),

@@ -626,7 +626,7 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     effect = Effect.free("arm", nothing, flange_jacobian={ROBOT: moves})
     wider = problem.with_effects([*problem.effects, effect])
     there = replace(fit.state, values=np.append(fit.state.values, np.zeros(3)))
-    beside = robot_likelihood(problem, fit.state, fit.noise).beside(0, moves)
+    beside = robot_likelihood(problem, fit.state, fit.noise).with_moves(0, moves)
     expected = robot_likelihood(wider, there, fit.noise)
     np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
     if kind != "combined":

@@ -190,7 +190,7 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     # How well levels of noise are known, and errors of the arm that no stop shows, are told of data
     # alone.
     assert not found[0].robot_arm.errors.gain
-    sources = solved.fit.beside
+    sources = solved.fit.by_source
     covariance = solved.fit.whole - sources["noise_level"] - sources["arm"]
     sigmas = np.sqrt(np.diag(covariance)[:6])
     # The plan's weak prior of 0.2 m and rad is all that differs.
@@ -212,7 +212,7 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     design = next_best(begun, HAND_EYE, q)
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
     beside = ("size of arm errors", "noise_level")
-    not_known = sum((known.assessment.fit.beside.get(name, 0.0) for name in beside), 0.0)
+    not_known = sum((known.assessment.fit.by_source.get(name, 0.0) for name in beside), 0.0)
     covariance = known.assessment.fit.whole - not_known
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     world = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]

@@ -47,11 +47,11 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
     if len(np.unique(stops)) < FEWEST_STOPS or not size:
         return None
     start = likelihood.start_beside([likelihood.moved(robot, basis)], np.array([_NOTHING]))
-    beside, seen = (
-        likelihood.beside(robot, basis, np.ones((size, 1))),
+    extended, seen = (
+        likelihood.with_moves(robot, basis, np.ones((size, 1))),
         np.repeat(likelihood.seen, 2),
     )
-    sigmas, value = beside.most_likely(
+    sigmas, value = extended.most_likely(
         start,
         np.append(seen, True),
         np.append(np.full(len(start) - 1, LEAST_SIGMA), _NOTHING),
@@ -63,7 +63,8 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
     else:
         levels = [np.append(likelihood.white[0], at) for at in _SIZES]
         gains = [
-            likelihood.white[1] - beside.most_likely(at, np.append(seen, False))[1] for at in levels
+            likelihood.white[1] - extended.most_likely(at, np.append(seen, False))[1]
+            for at in levels
         ]
         shares = _SIZE_PRIOR * np.exp(np.minimum(gains, 0.5 * SIGNIFICANT))
         sigma = np.sqrt(shares @ _SIZES**2 / (1.0 - _SIZE_PRIOR.sum() + shares.sum()))

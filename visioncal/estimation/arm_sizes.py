@@ -123,7 +123,9 @@ def estimate_arm_sizes(
         blocks = replace(plain, bases=every, low=tuple(_variances(length)[:2].tolist()))
         tried = None
         # Skips the search where the gain seems too small.
-        _, gain = plain.likelihood.model.likely_size(found, blocks.columns(HARMONICS), plain.mine)
+        _, gain = plain.likelihood.model.likely_size(
+            found, blocks.columns(HARMONICS), plain.robot_units
+        )
         if 2.0 * gain > _LEAST_GAIN:
             logs = np.append(best.logs[: len(found.logs)], np.log(_TYPICAL[HARMONICS]))
             tried = blocks.most_likely(logs)
@@ -192,10 +194,10 @@ class _Blocks:
         factor = {COMPLIANCE: self.torque_nm / 10.0}
         typical = np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.bases])
         basis = np.concatenate(list(self.bases.values()), axis=2)
-        return self.nominal.beside(self.robot, basis, self.shares, typical)
+        return self.nominal.with_moves(self.robot, basis, self.shares, typical)
 
     @cached_property
-    def mine(self) -> Mask:
+    def robot_units(self) -> Mask:
         """(u,) mask of the units of the robot: no other depends on its errors."""
         return np.asarray((self.nominal.members == self.robot).any(axis=1))
 
@@ -208,7 +210,7 @@ class _Blocks:
 
     def columns(self, name: str) -> FloatArray:
         """(m, 6 w, p) Jacobian of the robot's units by a block's errors."""
-        return np.asarray(self.likelihood.jacobian[self.mine][:, :, self.slice_of(name)])
+        return np.asarray(self.likelihood.jacobian[self.robot_units][:, :, self.slice_of(name)])
 
     def start(self) -> FloatArray:
         """Logarithms (2 r + g,): sizes that explain all residuals, beside little noise."""
@@ -281,7 +283,7 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
     # Combinations that the observations do not determine keep their prior.
     block, second = errors[HARMONICS], errors.pop(_SECOND)
     share = second.sigma / block.sigma
-    weights = np.linalg.inv(arm.likelihood.model.units.total(best.logs)[arm.mine])
+    weights = np.linalg.inv(arm.likelihood.model.units.total(best.logs)[arm.robot_units])
     jacobian = np.concatenate([share * arm.columns(_SECOND), arm.columns(HARMONICS)], axis=2)
     scaled = jacobian * block.sigma
     values, vectors = np.linalg.eigh(gram(scaled, weights @ scaled))

@@ -43,9 +43,9 @@ class _Gain:
         white = Whitening.of(problem, noise, linear.by_errors)
         rows, unit_of = white.inverse(linear.jacobian @ columns), problem.units[0]
         errors = np.zeros((white.count, linear.by_errors.shape[2], columns.shape[1]))
-        own = unit_of >= 0
-        by_errors = np.swapaxes(linear.by_errors[own], 1, 2)
-        np.add.at(errors, unit_of[own], by_errors @ rows[own])
+        in_unit = unit_of >= 0
+        by_errors = np.swapaxes(linear.by_errors[in_unit], 1, 2)
+        np.add.at(errors, unit_of[in_unit], by_errors @ rows[in_unit])
         return cls(rows, errors, columns)
 
     def of_flange(self, problem: Problem, robot: int, variances: FloatArray) -> FloatArray:
@@ -67,14 +67,16 @@ def covariance_by_source(
     where they compensate each other.
     """
     edges = 6 * len(problem.unknown)
-    gain, own = _Gain.of(problem, state, noise, edges), problem.covariance(noise)
+    gain, sensor_covariance = _Gain.of(problem, state, noise, edges), problem.covariance(noise)
     parts: dict[str, FloatArray] = defaultdict(lambda: np.zeros((edges, edges)))
     observers = np.array(problem.observations.observers)
     for frame in dict.fromkeys(problem.observations.observers):
         rows = observers == frame
         # If the observations' own noise is unknown, the robot's noise includes it.
-        if own[rows].any():
-            parts[sources.sensors[frame]] += gram(gain.rows[rows], own[rows] @ gain.rows[rows])
+        if sensor_covariance[rows].any():
+            parts[sources.sensors[frame]] += gram(
+                gain.rows[rows], sensor_covariance[rows] @ gain.rows[rows]
+            )
     for index, robot in enumerate(problem.robots):
         parts[sources.robots[robot]] += gain.of_flange(problem, index, noise.robots[index] ** 2)
     prior_info = problem.prior_information(state).information

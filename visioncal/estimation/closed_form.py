@@ -92,9 +92,9 @@ def rotation_pairs(robot: FloatArray, camera: FloatArray) -> Pairs:
     views = robot.shape[-3]
     order = np.random.default_rng(0).permutation(views) if views > _GROUP else np.arange(views)
     groups = np.array_split(order, -(-views // _GROUP))
-    both = [upper_pairs(len(group)) for group in groups]
+    group_pairs = [upper_pairs(len(group)) for group in groups]
     first, second = (
-        np.concatenate([group[pair[at]] for group, pair in zip(groups, both, strict=True)])
+        np.concatenate([group[pair[at]] for group, pair in zip(groups, group_pairs, strict=True)])
         for at in (0, 1)
     )
     # Relative quaternions take a third of the time of relative matrices.
@@ -108,8 +108,8 @@ def rotation_pairs(robot: FloatArray, camera: FloatArray) -> Pairs:
 def _quaternions(motions: FloatArray) -> FloatArray:
     """Unit quaternions (..., 4, n) of (..., n, 4, 4) motions, the scalar first."""
     vector, scalar = quaternions(motions[..., :3, :3].reshape(-1, 3, 3))
-    both = np.concatenate([scalar[:, None], vector], axis=1)
-    unit = both / np.sqrt(np.sum(both**2, axis=1))[:, None]
+    scalar_first = np.concatenate([scalar[:, None], vector], axis=1)
+    unit = scalar_first / np.sqrt(np.sum(scalar_first**2, axis=1))[:, None]
     return np.swapaxes(unit.reshape(*motions.shape[:-2], 4), -1, -2)
 
 

@@ -60,8 +60,8 @@ class Closure:
         """(m, 6, 6) Jacobian by errors of a robot's flange, on its right."""
         of, members = self.problem.units
         by_slots = self.linear.by_flanges.reshape(len(of), 6, -1, 6)
-        mine = members[of] == self.problem.robots.index(robot)
-        return np.asarray(np.einsum("mw,mawb->mab", mine, by_slots))
+        robot_slots = members[of] == self.problem.robots.index(robot)
+        return np.asarray(np.einsum("mw,mawb->mab", robot_slots, by_slots))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +69,11 @@ class Fit:
     """Estimates of all unknowns, from the observations that agree, with their covariance."""
 
     problem: Problem  # The observations that agree, with everything that is unknown.
-    solution: Solution  # Its unknowns and noise levels.
+    solution: Solution  # The unknowns and noise levels.
     # All corners, linearised in poses, lenses and boards; None without images.
     corners: LinearisedCorners | None = None
     # (p, p) covariances from sources other than noise and priors, by source.
-    beside: Mapping[str, FloatArray] = field(default_factory=dict)
+    by_source: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def state(self) -> State:
@@ -198,10 +198,10 @@ class Fit:
         part = self.problem.subset(np.isin(np.arange(len(self.seen)), rows))
         poses, carry, seen = part.measured(self.state), np.eye(6), part.observations
         if frame:
-            there = replace(seen, observers=(frame,) * len(seen), observed=seen.observers)
+            reverse = replace(seen, observers=(frame,) * len(seen), observed=seen.observers)
             every = np.ones(len(seen), dtype=bool)
-            seen = replace(seen, observed=there.observers, has_rotation=every)
-            poses = replace(part, observations=there).predicted(self.state) @ poses
+            seen = replace(seen, observed=reverse.observers, has_rotation=every)
+            poses = replace(part, observations=reverse).predicted(self.state) @ poses
             part = replace(part, observations=seen, points=frozenset(), with_repeats=False)
             carry = adjoint(poses)
         effects, at, boards = [], 6 * len(self.frames), self.unknowns.of_kinds(BOARD, SIZE)
@@ -253,7 +253,7 @@ class Fit:
         values = [self.state.values, *(effect.values for effect in effects)]
         state = State(self.state.edges, np.concatenate(values))
         problem = self.problem.with_effects([*self.problem.effects, *effects])
-        return replace(self.at(state), problem=problem, beside={})
+        return replace(self.at(state), problem=problem, by_source={})
 
     @cached_property
     def by_noise(self) -> FloatArray:
@@ -263,7 +263,7 @@ class Fit:
     @cached_property
     def whole(self) -> FloatArray:
         """(p, p) covariance of the unknowns from all sources."""
-        return np.asarray(sum(self.beside.values(), self.by_noise))
+        return np.asarray(sum(self.by_source.values(), self.by_noise))
 
     @cached_property
     def shift(self) -> FloatArray:
@@ -279,12 +279,12 @@ class Fit:
     def beside_lasting(self, robot: str, errors: ArmErrors) -> "Fit":
         """The fit with an arm's errors that last in time among the unknowns, before a step.
 
-        Its noise is what is left beside them.
+        The noise is the rest beside these errors.
         """
         in_time, index = errors.basis[:, :, errors.is_time_correlated], self.robots.index(robot)
         noise = self.noise if errors.white is None else self.noise.with_robot(index, errors.white)
-        own = replace(errors, basis=in_time, time_correlated_count=in_time.shape[2])
-        wide = self.with_columns(arm_effect(own, robot, "lasting errors"))
+        time_errors = replace(errors, basis=in_time, time_correlated_count=in_time.shape[2])
+        wide = self.with_columns(arm_effect(time_errors, robot, "lasting errors"))
         return replace(wide, solution=replace(wide.solution, noise=noise))
 
     def step_to(self, wide: "Fit") -> FloatArray:

@@ -46,11 +46,11 @@ class Jacobians:
     @classmethod
     def of_stops(cls, arm: ArmData) -> "Jacobians":
         """Root of the information of an arm's observations, without priors."""
-        both = np.concatenate([arm.frames, arm.columns[arm.model.is_kept]])
+        columns = np.concatenate([arm.frames, arm.columns[arm.model.is_kept]])
         fit = arm.fit
         information = fisher_information(fit.problem, fit.state, fit.noise)
         information -= fit.problem.prior_information(fit.state).information
-        values, vectors = np.linalg.eigh(information[np.ix_(both, both)])
+        values, vectors = np.linalg.eigh(information[np.ix_(columns, columns)])
         root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
         return cls(root[:, : len(arm.frames)], arm.error_rad * root[:, len(arm.frames) :])
 

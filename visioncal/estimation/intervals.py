@@ -39,19 +39,19 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
     for robot in np.flatnonzero(likelihood.seen).tolist():
         rotation, translation = noise.robots[robot]
         ratio, middle, width = translation / rotation, float(translation), 1.0
-        at, mine = np.log(np.maximum(noise.robots, LEAST_SIGMA)).ravel(), 2 * robot + np.arange(2)
+        at, levels = np.log(np.maximum(noise.robots, LEAST_SIGMA)).ravel(), 2 * robot + np.arange(2)
         if min(rotation, translation) < _NOTHING:
             factor = np.exp(RATIO_LOG_SIGMA)
             ratio = np.clip(ratio, TYPICAL_RATIO / factor, TYPICAL_RATIO * factor)
             middle = max(middle, _LEAST_MIDDLE_M)
-            at[mine] = np.log([middle / ratio, middle])
+            at[levels] = np.log([middle / ratio, middle])
         else:
-            curvature = likelihood.model.at(at).curvature[np.ix_(mine, mine)]
+            curvature = likelihood.model.at(at).curvature[np.ix_(levels, levels)]
             width = max(float(np.sum(curvature)), 1.0) ** -0.5
         first, last = np.arcsinh(np.array(_ENDS) / width).tolist()
         steps = width * np.sinh(np.linspace(first, last, _STEPS))
         logs = np.tile(at, (_STEPS, 1))
-        logs[:, mine] += steps[:, None]
+        logs[:, levels] += steps[:, None]
         values = np.array([likelihood.model.at(row, is_sloped=False).value for row in logs])
         translations = middle * np.exp(steps)
         weights = np.exp(values.min() - values) * np.gradient(steps)

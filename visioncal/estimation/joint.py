@@ -106,8 +106,8 @@ def diverging() -> Iterator[None]:
 def others_of(fitted: Fit) -> FloatArray:
     """(k,) values of all effects but lenses and boards."""
     first = fitted.lens_columns.start
-    mine = fitted.problem.effect_columns.get(LENSES, slice(first, first))
-    return fitted.state.values[mine.stop - first :]
+    lens_columns = fitted.problem.effect_columns.get(LENSES, slice(first, first))
+    return fitted.state.values[lens_columns.stop - first :]
 
 
 def _change(fitted: Fit) -> FloatArray:
@@ -178,13 +178,15 @@ class MeasuredScale:
 def estimated_scale(fitted: Fit, name: str, target: Target) -> MeasuredScale | None:
     """Scale of a board in a fit, by its name in the session; None where the fit does not move it.
 
-    Its sigma is without `BOARD_OR_ARM`.
+    The sigma is without `BOARD_OR_ARM`.
     """
     board = BOARD, name
     if target.is_rig or SCALE not in fitted.unknowns.values_of(board, moved=True):
         return None
-    beside = {source: part for source, part in fitted.beside.items() if source != BOARD_OR_ARM}
-    sigma = float(replace(fitted, beside=beside).sigmas(board)[SCALE])
+    other_sources = {
+        source: part for source, part in fitted.by_source.items() if source != BOARD_OR_ARM
+    }
+    sigma = float(replace(fitted, by_source=other_sources).sigmas(board)[SCALE])
     stated = float(stated_board_sigma(target)[SCALE])
     return MeasuredScale(float(fitted.values(board)[SCALE]), sigma, stated)
 

@@ -96,7 +96,7 @@ class SizePrior:
             row[first], row[second] = -1.0 / RATIO_LOG_SIGMA, 1.0 / RATIO_LOG_SIGMA
         return cls(jacobian, np.full(len(pairs), np.log(TYPICAL_RATIO) / RATIO_LOG_SIGMA))
 
-    def beside(self, typical: FloatArray, log_sigma: float) -> "SizePrior":
+    def with_sizes(self, typical: FloatArray, log_sigma: float) -> "SizePrior":
         """The prior with g more sizes, of (g,) typical logarithms within `log_sigma`."""
         return SizePrior(
             np.asarray(block_diag(self.jacobian, np.eye(len(typical)) / log_sigma)),
@@ -180,28 +180,28 @@ class MixedModel:
         value += float(np.sum(left.residuals**2))
         value -= float(values @ (2.0 * known.gradient - known.information @ values))
         flat = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
-        here = MixedEstimate(0.5 * value, *flat, logs, values, root)
-        gradient, curvature = self._slopes(here, left) if is_sloped else flat
+        estimate = MixedEstimate(0.5 * value, *flat, logs, values, root)
+        gradient, curvature = self._slopes(estimate, left) if is_sloped else flat
         if self.prior is not None:
             prior = self.prior.at(logs)
             gradient, curvature = gradient + prior.gradient, curvature + prior.curvature
             value += 2.0 * prior.value
-        return replace(here, value=0.5 * value, gradient=gradient, curvature=curvature)
+        return replace(estimate, value=0.5 * value, gradient=gradient, curvature=curvature)
 
-    def _slopes(self, here: MixedEstimate, at: WhiteUnits) -> tuple[FloatArray, FloatArray]:
+    def _slopes(self, estimate: MixedEstimate, at: WhiteUnits) -> tuple[FloatArray, FloatArray]:
         """Gradient (k,) and average information (k, k) by the logarithms of the sizes."""
-        variances, values, root = np.exp(2.0 * here.logs), here.values, here.root
+        variances, values, root = np.exp(2.0 * estimate.logs), estimate.values, estimate.root
         by_size, unit = np.zeros(len(variances)), self.units
         is_random = self.shares.any(axis=1)
-        own = self.shares[is_random] @ variances
+        random_variances = self.shares[is_random] @ variances
         # Variance of each random unknown by each size.
         parts = self.shares[is_random] * variances
         posterior = np.sum(root[is_random] ** 2, axis=1) + values[is_random] ** 2
-        by_size += (1.0 / own - posterior / own**2) @ parts
+        by_size += (1.0 / random_variances - posterior / random_variances**2) @ parts
         # Working variates: derivatives of the covariance by the logarithm of each size, times the
         # weighted residuals. Their products, less what the unknowns absorb, are the information.
         along = np.zeros((len(values), len(variances)))
-        along[is_random] = 2.0 * parts * (values[is_random] / own)[:, None]
+        along[is_random] = 2.0 * parts * (values[is_random] / random_variances)[:, None]
         back = np.swapaxes(at.whitening, 1, 2)
         fitted = times_root(at.jacobian, root)
         remaining = np.eye(fitted.shape[1]) - fitted @ np.swapaxes(fitted, 1, 2)
@@ -221,7 +221,7 @@ class MixedModel:
         return by_size, 0.5 * (average - projected.T @ projected)
 
     def likely_size(
-        self, here: MixedEstimate, moved: FloatArray, among: Mask
+        self, estimate: MixedEstimate, moved: FloatArray, among: Mask
     ) -> tuple[float, float]:
         """Maximum-likelihood size of more random unknowns of equal variance, beside an estimate.
 
@@ -229,10 +229,10 @@ class MixedModel:
         unknowns' information. `moved` is the (n, d, j) Jacobian of the n units in the (u,)
         mask `among`. Returns the size within a tenth, and its gain of log-likelihood, or zeros.
         """
-        own = self.units.white(here.logs)
-        residuals = own.residuals - own.jacobian @ here.values
-        moved = own.whitening[among] @ moved
-        absorbed = here.root.T @ gram(own.jacobian[among], moved)
+        white = self.units.white(estimate.logs)
+        residuals = white.residuals - white.jacobian @ estimate.values
+        moved = white.whitening[among] @ moved
+        absorbed = estimate.root.T @ gram(white.jacobian[among], moved)
         information = gram(moved, moved) - absorbed.T @ absorbed
         values, vectors = np.linalg.eigh(information)
         # Directions that the parameters absorb entirely hold rounding only.

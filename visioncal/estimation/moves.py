@@ -156,25 +156,25 @@ def find_creep(
     """How many more observations agree where a frame creeps, and its (6,) twist; None for few.
 
     See `with_creep`. Observations agree by what they are of, since the frame may be all that ties
-    its observers. Its speed is the median of those of their pairs (Theil 1950, Sen 1968).
+    its observers. The speed is the median of those of their pairs (Theil 1950, Sen 1968).
     """
     rows = problem.observations.involves(frame)
     part, among = problem.subset(rows), len(problem)
     changes, covariance = _implied_changes(part, fit, frame)
     left, groups = -_progress(part.observations.stops, problem), [at.rows for at in part.groups]
     speeds = list[FloatArray]()
-    for own in groups:
-        first, second = np.nonzero(left[own][:, None] - left[own] > _APART)
-        between = log(invert(changes[own[second]]) @ changes[own[first]])
-        speeds.append(between / (left[own[first]] - left[own[second]])[:, None])
+    for group in groups:
+        first, second = np.nonzero(left[group][:, None] - left[group] > _APART)
+        between = log(invert(changes[group[second]]) @ changes[group[first]])
+        speeds.append(between / (left[group[first]] - left[group[second]])[:, None])
     speed = np.median(np.concatenate(speeds), axis=0) if sum(map(len, speeds)) else np.zeros(6)
     ends, weights = changes @ exp(-left[:, None] * speed), np.linalg.inv(covariance)
     count = 0
-    for own in groups:
-        middle = own[np.argsort(np.linalg.norm(ends[own, :3, 3], axis=1))[len(own) // 2]]
-        away = log(invert(ends[middle]) @ ends[own])
-        # Two of them differ.
-        squares = np.einsum("ni,nij,nj->n", away, weights[own], away) / 2.0
+    for group in groups:
+        middle = group[np.argsort(np.linalg.norm(ends[group, :3, 3], axis=1))[len(group) // 2]]
+        away = log(invert(ends[middle]) @ ends[group])
+        # A difference of two places has twice the variance.
+        squares = np.einsum("ni,nij,nj->n", away, weights[group], away) / 2.0
         count += int((squares < _noise_limit(among)).sum())
     return (count - int(agrees[rows].sum()), speed) if count >= 2 * FEWEST_VIEWS else None
 

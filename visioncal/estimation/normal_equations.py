@@ -61,11 +61,11 @@ class Whitening:
     ) -> "Whitening":
         """Whitens observations with Jacobian (n, 6, 6 w) by their units' errors."""
         # Observations not in `among` get zero weight.
-        (unit_of, members), alone = problem.units, problem.alone
+        (unit_of, members), is_single = problem.units, problem.is_single
         weights, errors = problem.weights(noise), problem.error_covariance(noise)
-        own, jacobian = problem.covariance(noise)[alone], by_errors[alone]
-        own += jacobian @ errors[unit_of[alone]] @ np.swapaxes(jacobian, 1, 2)
-        weights[alone], units = np.linalg.inv(own), np.where(alone, -1, unit_of)
+        covariance, jacobian = problem.covariance(noise)[is_single], by_errors[is_single]
+        covariance += jacobian @ errors[unit_of[is_single]] @ np.swapaxes(jacobian, 1, 2)
+        weights[is_single], units = np.linalg.inv(covariance), np.where(is_single, -1, unit_of)
         if among is not None:
             weights[~among] = 0.0
         shared, width = units >= 0, by_errors.shape[2]
@@ -129,14 +129,14 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
     all_weights = problem.weights(noise)
     unit_of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
-    total, alone = np.zeros((size + 1, size + 1)), problem.alone
-    own, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))
+    total, is_single = np.zeros((size + 1, size + 1)), problem.is_single
+    unit_information, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))
     cross, solved = (np.zeros((len(members), width, size + 1)) for _ in range(2))
     for block in linear.blocks:
         # Residuals are the last column.
         columns = np.append(block.columns, size)
         augmented = np.concatenate([block.jacobian, linear.residuals[block.rows, :, None]], axis=2)
-        single = alone[block.rows]
+        single = is_single[block.rows]
         if single.any():
             rows = block.rows[single]
             turned = np.linalg.inv(linear.by_errors[rows, :, :6])
@@ -157,13 +157,13 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
         units, first = np.unique(unit_of[rows[order]], return_index=True)
         by_errors = linear.by_errors[rows[order]]
         turned = np.swapaxes(by_errors, 1, 2)
-        own[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
+        unit_information[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
         entries = np.ix_(units, np.arange(width), columns)
         cross[entries] += np.add.reduceat(turned @ weighted[order], first)
-    multiple = np.setdiff1d(np.arange(len(members)), unit_of[alone])
-    inverse[multiple], null_variance[multiple] = _pseudo_inverse(own[multiple])
+    multiple = np.setdiff1d(np.arange(len(members)), unit_of[is_single])
+    inverse[multiple], null_variance[multiple] = _pseudo_inverse(unit_information[multiple])
     solved[multiple] = inverse[multiple] @ cross[multiple]
-    by_flanges[multiple] = inverse[multiple] @ own[multiple]
+    by_flanges[multiple] = inverse[multiple] @ unit_information[multiple]
     # The estimated error has the opposite sign of the residual that it causes.
     total = total - gram(cross[multiple], solved[multiple])
     known = problem.prior_information(state)

@@ -257,6 +257,6 @@ def directions(
     found = []
     for frame, edge in problem.unknown.items():
         columns = problem.edge_columns(frame)
-        both = edge_directions(state.edges[edge], covariance[columns, columns], *names[frame])
-        found += [(frame, item) for item in (both[:1] if frame in problem.points else both)]
+        ordered = edge_directions(state.edges[edge], covariance[columns, columns], *names[frame])
+        found += [(frame, item) for item in (ordered[:1] if frame in problem.points else ordered)]
     return tuple(found)

@@ -59,21 +59,21 @@ def far_parameters(
     information = vectors * np.maximum(values, 0.0) @ vectors.T
     seen = (information + np.eye(len(columns))) @ (arm.model.values / size)
     others = _Rest(information, seen, np.ones(len(columns)))
-    found, beside = list[FarParameter](), dict[bytes, list[_Rest]]()
+    found, rests_of = list[FarParameter](), dict[bytes, list[_Rest]]()
     for at, direction in enumerate(np.linalg.pinv(moves).T):
         if not moves[at].any():
             continue
         blocks = map(arm.model.columns_of, arm.model.weights)
-        own, whole = np.zeros(len(columns), dtype=bool), np.sum(direction**2)
+        in_blocks, whole = np.zeros(len(columns), dtype=bool), np.sum(direction**2)
         for block in blocks:
-            own[block] = np.sum(direction[block] ** 2) > _OF_BLOCK * whole
+            in_blocks[block] = np.sum(direction[block] ** 2) > _OF_BLOCK * whole
         # Parameters of one kind share their blocks.
-        if (key := own.tobytes()) not in beside:
-            sizes = (np.where(own, rest, 1.0) for rest in _RESTS.tolist())
-            beside[key] = [_Rest(information, seen, each) for each in sizes]
+        if (key := in_blocks.tobytes()) not in rests_of:
+            sizes = (np.where(in_blocks, rest, 1.0) for rest in _RESTS.tolist())
+            rests_of[key] = [_Rest(information, seen, each) for each in sizes]
         prior = _MISTYPED_RAD * parameters[at].unit / size
         fits = []
-        for rest, errors in zip(_RESTS.tolist(), beside[key], strict=True):
+        for rest, errors in zip(_RESTS.tolist(), rests_of[key], strict=True):
             gain, change, sigma = errors.with_free(direction, prior)
             fits.append(FarParameter(at, size * change, size * sigma, rest, gain - others.log))
         found.append(max(fits, key=lambda fit: fit.gain))
@@ -103,9 +103,9 @@ class _Rest:
     def with_free(self, direction: FloatArray, prior: float) -> tuple[float, float, float]:
         """Log evidence with a step along a direction, the step and its sigma."""
         by_step = self._information @ direction
-        beside = self._covariance @ by_step
-        weight = float(direction @ by_step - by_step @ beside)
-        pull = float(direction @ self._seen - beside @ self._seen)
+        absorbed = self._covariance @ by_step
+        weight = float(direction @ by_step - by_step @ absorbed)
+        pull = float(direction @ self._seen - absorbed @ self._seen)
         variance = 1.0 / (weight + prior**-2.0)
         log = self.log + 0.5 * pull**2 * variance - 0.5 * float(np.log1p(prior**2 * weight))
         return log, pull * variance, float(np.sqrt(variance))

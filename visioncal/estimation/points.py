@@ -67,13 +67,13 @@ class Groups:
         return self._units().total(np.log([sigma]))
 
     def _units(self) -> Units:
-        both = self.observed[:, :, None] & self.observed[:, None, :]
+        pair_mask = self.observed[:, :, None] & self.observed[:, None, :]
         identity = np.eye(self.observed.shape[1])
         absent = identity * ~self.observed[:, None, :]
         return Units(
             self.residuals,
             self.jacobian,
-            np.where(both, self.known, 0.0) + absent,
+            np.where(pair_mask, self.known, 0.0) + absent,
             (identity * self.observed[:, None, :])[None],
             np.zeros(1, dtype=np.int64),
         )
@@ -145,8 +145,8 @@ class PointProblem:
             columns.insert(0, skew(lever))
         if self.measured is None:
             turns = rotation.T @ self.carriers[:, :3, :3]
-            own = np.eye(len(state.points))[self.points]
-            by_points = turns[:, :, None, :] * own[:, None, :, None]
+            selection = np.eye(len(state.points))[self.points]
+            by_points = turns[:, :, None, :] * selection[:, None, :, None]
             columns.append(by_points.reshape(count, 3, -1))
         if self.scaled:
             columns.append(-self.nominal[:, :, None])

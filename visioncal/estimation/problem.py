@@ -197,14 +197,14 @@ class Problem:
         return through
 
     @cached_property
-    def alone(self) -> Mask:
+    def is_single(self) -> Mask:
         """(n,) mask of measured poses with one flange error, shared by no other observation."""
         of, members = self.units
         count = np.bincount(of[of >= 0], minlength=len(members))
         single = (count == 1) & (members[:, 1:] < 0).all(axis=1)
-        alone = (of >= 0) & self.observations.has_rotation
-        alone[alone] = single[of[alone]]
-        return alone
+        is_single = (of >= 0) & self.observations.has_rotation
+        is_single[is_single] = single[of[is_single]]
+        return is_single
 
     @cached_property
     def repeat_counts(self) -> FloatArray:
@@ -465,7 +465,7 @@ class Problem:
     @cached_property
     def _own_weights(self) -> FloatArray:
         """(n, 6, 6) `weights` at levels of one."""
-        inverse, joined = np.zeros_like(self._own_covariance), ~self.alone
+        inverse, joined = np.zeros_like(self._own_covariance), ~self.is_single
         inverse[joined] = np.linalg.inv(self._own_covariance[joined])
         return inverse
 
@@ -474,7 +474,7 @@ class Problem:
         return np.asarray(self._variances(noise) * self._own_covariance)
 
     def weights(self, noise: Noise) -> FloatArray:
-        """Inverses (n, 6, 6) of `covariance`; zero for observations that are `alone`."""
+        """Inverses (n, 6, 6) of `covariance`; zero for observations that `is_single` has."""
         return np.asarray(self._own_weights / self._variances(noise))
 
     def total_covariance(self, linear: Linear, noise: Noise) -> FloatArray:

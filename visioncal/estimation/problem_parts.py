@@ -305,11 +305,13 @@ def units_of(
     count, joined = len(robots), []
     first = np.full(len(stops), -1, dtype=np.int64)
     for group in groups:
-        mine = [robots.index(step.robot) for step in group.path if step.robot]
+        robot_indices = [robots.index(step.robot) for step in group.path if step.robot]
         keys = stops[group.rows] * count
-        if mine:
-            first[group.rows] = keys + mine[0]
-            joined += [np.stack([keys + mine[0], keys + index], axis=1) for index in mine]
+        if robot_indices:
+            first[group.rows] = keys + robot_indices[0]
+            joined += [
+                np.stack([keys + robot_indices[0], keys + index], axis=1) for index in robot_indices
+            ]
     if not joined:
         return first, np.zeros((0, 1), dtype=np.int64)
     used, pairs = np.unique(np.concatenate(joined), return_inverse=True)

@@ -91,8 +91,8 @@ class RobotLikelihood:
     def start_beside(self, moved: Sequence[FloatArray], least: FloatArray) -> FloatArray:
         """Initial sigmas (2 r + g,) with g groups of additional random effects.
 
-        They explain all residuals, beside little noise: a search from much noise may stay there,
-        with sizes of next to nothing.
+        The sizes explain all residuals, beside little noise: a search from much noise may stay
+        there, with sizes of next to nothing.
 
         Args:
             moved: (m, 6 w, p) Jacobian of a robot's units by the effects of each group.
@@ -114,7 +114,7 @@ class RobotLikelihood:
         start = np.where(self.seen[:, None], start, self.before)
         return self.most_likely(start, np.repeat(self.seen, 2))
 
-    def beside(
+    def with_moves(
         self,
         robot: int,
         moves: FloatArray,
@@ -136,11 +136,11 @@ class RobotLikelihood:
         jacobian = np.zeros((*units.residuals.shape, count))
         jacobian[(self.members == robot).any(axis=1)] = self.moved(robot, moves)
         units = replace(units, jacobian=np.concatenate([units.jacobian, jacobian], axis=2))
-        own, prior = np.zeros((count, 0)) if shares is None else shares, self.model.prior
+        new_shares, prior = np.zeros((count, 0)) if shares is None else shares, self.model.prior
         # A prior of infinite width is none.
         if prior is not None:
-            prior = prior.beside(
-                np.zeros(own.shape[1]) if typical is None else typical,
+            prior = prior.with_sizes(
+                np.zeros(new_shares.shape[1]) if typical is None else typical,
                 np.inf if typical is None else 1.0,
             )
         model = replace(
@@ -150,7 +150,7 @@ class RobotLikelihood:
             common=PriorInformation(
                 np.pad(known.information, (0, count)), np.pad(known.gradient, (0, count))
             ),
-            shares=np.asarray(block_diag(self.model.shares, own)),
+            shares=np.asarray(block_diag(self.model.shares, new_shares)),
         )
         return replace(self, model=model)
 

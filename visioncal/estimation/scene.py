@@ -186,8 +186,8 @@ class CornerProblem:
         freedom = 0.0 if found is None else found.freedom
         # Values that nothing determines are none.
         ridge = _RIDGE * np.diag(np.diag(information) + 1.0)
-        own = float(np.trace(np.linalg.solve(information + prior + ridge, information)))
-        return 6 * len(compressed.information) + round(own + freedom)
+        effective = float(np.trace(np.linalg.solve(information + prior + ridge, information)))
+        return 6 * len(compressed.information) + round(effective + freedom)
 
     def sigma_px(self, compressed: Compressed) -> float:
         """Noise of a corner's coordinate [px]; see `CornerStack.sigma_px`."""

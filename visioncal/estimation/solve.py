@@ -199,9 +199,10 @@ def estimate_noise(
 def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Squared posterior residuals (n,) of the observations, and their expected values (n,).
 
-    They are in units of their own noise, after a Gauss-Newton step and less the flange errors.
+    Residuals are in units of the observations' noise, after a Gauss-Newton step and less the flange
+    errors.
     """
-    own, linear = problem.covariance(noise), problem.linear(state)
+    covariance, linear = problem.covariance(noise), problem.linear(state)
     whitening = Whitening.of(problem, noise, linear.by_errors)
     information, gradient, _, shared = whitening.equations(problem, state, linear)
     fitted = covariance_among(information, problem.moving)
@@ -218,9 +219,9 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     remaining = weights - weights @ absorbed
     remaining -= np.swapaxes(taken, 1, 2) @ of_unit[units] @ taken
     pulled = whitening.inverse(left)
-    squares = np.sum(pulled * (own @ pulled), axis=(1, 2))
+    squares = np.sum(pulled * (covariance @ pulled), axis=(1, 2))
     unmeasured = np.where(problem.observations.has_rotation, 0.0, 3.0)
-    return squares, np.einsum("nij,nji->n", own, remaining) - unmeasured
+    return squares, np.einsum("nij,nji->n", covariance, remaining) - unmeasured
 
 
 def mahalanobis_sq(
@@ -255,7 +256,7 @@ def left_out_residuals(
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
     all_jacobians = linear.jacobian
-    errors, own, (unit_of, _) = (
+    errors, covariances, (unit_of, _) = (
         problem.error_covariance(noise),
         problem.covariance(noise),
         problem.units,
@@ -269,7 +270,7 @@ def left_out_residuals(
             array.reshape(6 * len(rows), -1)
             for array in (linear.by_errors[rows], all_jacobians[rows])
         )
-        total = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
+        total = block_diag(*covariances[rows]) + by_errors @ errors[unit] @ by_errors.T
         inverse = covariance_from(total - jacobian @ fitted @ jacobian.T)
         deletion[rows] = (total @ inverse @ linear.residuals[rows].ravel()).reshape(-1, 6)
     return deletion
@@ -284,20 +285,20 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
 
 
 def equations_from(
-    problem: Problem, solution: Solution, asked: IntArray
+    problem: Problem, solution: Solution, unknowns: IntArray
 ) -> Iterator[tuple[int, FloatArray, FloatArray]]:
     """Accumulates information and gradient of the observations from each stop on, last stop first.
 
     Yields:
         Each stop with the rows of the information (a, p) and gradient (a,) of it and all later
-        stops, without priors, for (a,) `asked` unknowns.
+        stops, without priors, for (a,) of the unknowns.
     """
     stops, linear = problem.observations.stops, problem.linear(solution.state)
     augmented = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
     # Errors are shared within a stop alone: the weights may be on either side.
     whitening = Whitening.of(problem, solution.noise, linear.by_errors)
-    weighted = whitening.inverse(augmented[:, :, asked])
-    total = np.zeros((len(asked), augmented.shape[2]))
+    weighted = whitening.inverse(augmented[:, :, unknowns])
+    total = np.zeros((len(unknowns), augmented.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         at_stop = stops == stop
         total = total + gram(weighted[at_stop], augmented[at_stop])

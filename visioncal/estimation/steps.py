@@ -193,15 +193,15 @@ def find_steps(
         tried[candidate.kind] += len(candidate.stops)
     steps = []
     for at, candidate in enumerate(candidates):
-        mine, among = slice(ends[at], ends[at + 1]), np.isin(stops, candidate.stops)
+        part, among = slice(ends[at], ends[at + 1]), np.isin(stops, candidate.stops)
         if not among.any():
             continue
         some = [equations[index] for index in np.flatnonzero(among)]
-        slopes = np.array([gradient[mine] for *_, gradient in some])
-        information = np.array([rows[mine] for _, rows, _ in some])
-        across, alone = information[:, :, :size], information[:, :, columns[at]]
-        left = alone - (across @ fitted) @ np.swapaxes(across, 1, 2)
-        blocks = np.stack([alone, left], axis=1)
+        slopes = np.array([gradient[part] for *_, gradient in some])
+        information = np.array([rows[part] for _, rows, _ in some])
+        across, unadjusted = information[:, :, :size], information[:, :, columns[at]]
+        left = unadjusted - (across @ fitted) @ np.swapaxes(across, 1, 2)
+        blocks = np.stack([unadjusted, left], axis=1)
         scale = np.sqrt(
             np.maximum(np.diagonal(blocks[:, 0], axis1=1, axis2=2), np.finfo(float).tiny)
         )
@@ -316,35 +316,38 @@ def twice(
         return None
     again = _other(*with_step(problem, fit, other), step) or step
     first, last = sorted((again, other), key=lambda one: one.stop)
-    gain, apart, there = evidence(problem, fit, first)
+    gain, apart, solution = evidence(problem, fit, first)
     frames = [step.of, [*apart.unknown][-1]]
-    beside = replace(last, candidate=replace(last.candidate, of=frames[-1]))
-    more, apart, there = evidence(apart, there, beside)
+    later = replace(last, candidate=replace(last.candidate, of=frames[-1]))
+    more, apart, solution = evidence(apart, solution, later)
     frames.append([*apart.unknown][-1])
-    edges = [there.state.edges[apart.unknown[frame]] for frame in frames]
-    # The fit without them is of one of three states, which are equally likely to be needed.
+    edges = [solution.state.edges[apart.unknown[frame]] for frame in frames]
+    # The fit without steps is of one of three states, which are equally likely to be needed.
     away = np.zeros((3, problem.size))
-    own, all_of = np.array([apart.unknown[name] for name in problem.unknown]), problem.unknown
+    edge_indices, all_of = (
+        np.array([apart.unknown[name] for name in problem.unknown]),
+        problem.unknown,
+    )
     for shift, edge in zip(away, edges, strict=True):
-        now = there.state.edges[own].copy()
+        now = solution.state.edges[edge_indices].copy()
         now[all_of[step.of]] = edge
         shift[: now.shape[0] * 6] = log(invert(fit.state.edges) @ now).ravel()
-        shift[now.shape[0] * 6 :] = there.state.values - fit.state.values
+        shift[now.shape[0] * 6 :] = solution.state.values - fit.state.values
     changes = [log(invert(before) @ after) for before, after in pairwise(edges)]
-    both = replace(
+    joint_step = replace(
         last,
         value=changes[1],
         gain=gain + more,
         spread=away.T @ away / 3.0,
         earlier=(replace(first, value=changes[0]),),
     )
-    return both, apart, there
+    return joint_step, apart, solution
 
 
-def _other(apart: Problem, there: Solution, step: Step) -> Step | None:
+def _other(apart: Problem, solution: Solution, step: Step) -> Step | None:
     """The likeliest step of the same frame, of which a problem has another, as one of its own."""
     frames = frames_of(apart, [step.of, [*apart.unknown][-1]])
-    found = find_steps(apart, there, frames, kinds=2)
+    found = find_steps(apart, solution, frames, kinds=2)
     return replace(found[0], candidate=step.candidate) if found else None
 
 

@@ -118,13 +118,13 @@ def _arms(
         for row in rows:
             if name not in row.robots:
                 continue
-            at, own = stations[row.station], row.robots[name]
-            numbers[at], approaches[at] = own.numbers, own.text.get("approach", "")
+            at, posed_row = stations[row.station], row.robots[name]
+            numbers[at], approaches[at] = posed_row.numbers, posed_row.text.get("approach", "")
             if report is None:
-                angles, stated = own.joints_rad, own.base_from_flange()
+                angles, stated = posed_row.joints_rad, posed_row.base_from_flange()
                 pose = None if stated is None else stated.as_matrix()
             else:
-                view = own.number if own.number in report.poses else row.view.number
+                view = posed_row.number if posed_row.number in report.poses else row.view.number
                 angles, pose = report.joints.get(view), report.poses.get(view)
             if model is not None and angles is not None:
                 joints[at] = angles

@@ -140,7 +140,7 @@ def _with_errors(recorded: RecordedStops, fit: Fit, *, has_joints: bool) -> Reco
     columns = [fit.problem.effect_columns[effect.name] for effect in recorded.fit.problem.effects]
     held = np.concatenate([np.zeros(0), *(gradient[part] for part in columns)])
     recorded = replace(recorded, held=held[:, None])
-    by_arm = fit.beside.get("arm")
+    by_arm = fit.by_source.get("arm")
     if has_joints or by_arm is None:
         return recorded
     index = fit.unknowns.columns(*recorded.fit.unknowns.all_of(EDGE)[:2])

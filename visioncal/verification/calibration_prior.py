@@ -168,12 +168,12 @@ class CalibrationPrior:
         if not len(chosen):
             return None
         kept = np.append(np.arange(count), count + chosen)
-        own = np.unique(calibrated.poses, axis=0, return_inverse=True)[1].reshape(-1)
+        calibrated_stops = np.unique(calibrated.poses, axis=0, return_inverse=True)[1].reshape(-1)
         return RepeatedStops(
             repeating[first],
             calibrated.residuals[chosen],
             correlation[np.ix_(kept, kept)],
-            np.append(stops, stops.max() + 1 + own[chosen]),
+            np.append(stops, stops.max() + 1 + calibrated_stops[chosen]),
             calibrated.by_noise,
         )
 

@@ -228,20 +228,20 @@ def _pairing(
     """
     problem = predicted.problem
     ((robot, poses),) = problem.poses.items()
-    own, at = problem.observations.stops, np.arange(len(problem))
+    stops, at = problem.observations.stops, np.arange(len(problem))
     away = np.zeros((len(poses), len(problem), 4, 4))
     for shift in range(len(poses)):
         others = np.roll(poses, -shift, axis=0)
         by_others = board_changes(replace(problem, poses={robot: others}), prior.state)
-        away[(own + shift) % len(poses), at] = by_others
+        away[(stops + shift) % len(poses), at] = by_others
     off_m = np.linalg.norm(log(away) / MOTION_UNITS, axis=2)
     nearest = np.argmin(off_m, axis=0)
-    is_off, is_placed = off_m[own, at] > _FAR_M, off_m[nearest, at] < _FAR_M
+    is_off, is_placed = off_m[stops, at] > _FAR_M, off_m[nearest, at] < _FAR_M
     moved, lost = np.flatnonzero(is_off & is_placed), np.flatnonzero(is_off & ~is_placed)
     if not len(moved) or len(lost) > 1:
         return
     by_sensor = np.zeros((len(problem), 6, 1 + 6 * len(lost)))
-    undone = invert(away[own[moved], moved]) @ away[nearest[moved], moved]
+    undone = invert(away[stops[moved], moved]) @ away[nearest[moved], moved]
     by_sensor[moved, :, 0] = log(undone)
     start, units = np.ones(1), np.full(1, _WHOLE)
     if len(lost):
@@ -251,7 +251,7 @@ def _pairing(
     views = np.array(predicted.views)
     pairs = zip(
         views[moved].tolist(),
-        views[np.unique(own, return_index=True)[1][nearest[moved]]].tolist(),
+        views[np.unique(stops, return_index=True)[1][nearest[moved]]].tolist(),
         strict=True,
     )
     yield ChangeHypothesis(PAIRING, units, by_sensor, start=start, pairs=tuple(pairs))

@@ -150,8 +150,8 @@ class Guard:
         self._looks, self._is_changed = false_alarm_looks, False
         # The lens's errors that go with those of the frames, and what is left of them.
         edges = 6 * len(prior.state.edges)
-        own, cross = prior.covariance[:edges, :edges], prior.covariance[edges:, :edges]
-        self._gain = np.linalg.solve(own, cross.T).T
+        edge_covariance, cross = prior.covariance[:edges, :edges], prior.covariance[edges:, :edges]
+        self._gain = np.linalg.solve(edge_covariance, cross.T).T
         self._rest = prior.covariance[edges:, edges:] - self._gain @ cross.T
         # Made once: a look takes milliseconds.
         self._free, self._arm = prior.free, prior.model
@@ -176,7 +176,7 @@ class Guard:
         self._noise = prior.noise(from_corners=self._free is not None)
         # An arm that is off by a millimetre has zeros that are off by a milliradian.
         zeros = np.full(len(joints), self._noise.robots[0, 1])
-        self._state = Detector.of(own, 1e-3 * slow_mm, zeros)
+        self._state = Detector.of(edge_covariance, 1e-3 * slow_mm, zeros)
 
     @property
     def holds(self) -> bool:

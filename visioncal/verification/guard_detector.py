@@ -202,17 +202,17 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     change = np.concatenate([rows.by_motion, rows.by_joints], axis=1)
     design = np.concatenate([rows.by_edges, rows.by_motion, change], axis=1)
     at, places = _place(state, rows)
-    own, root = places["offsets_covariance"][at], np.linalg.cholesky(rows.covariance)
+    offset_covariance, root = places["offsets_covariance"][at], np.linalg.cholesky(rows.covariance)
     seen, part = design @ covariance, root @ state.shape @ root.T
     noise = part + state.fresh * rows.by_arm
-    by_look = own + noise
+    by_look = offset_covariance + noise
     whiten = np.linalg.inv(np.linalg.cholesky(seen @ design.T + by_look))
     white = whiten @ (rows.residual - design @ mean - places["offsets"][at])
     squared = float(white @ white)
     share = min(1.0, float(np.sqrt(_FAR / max(squared, 1e-12))))
     clipped = share * white
     # Gains on whitened innovations.
-    gain, own_gain = (whiten @ seen).T, (whiten @ own).T
+    gain, own_gain = (whiten @ seen).T, (whiten @ offset_covariance).T
     signature = whiten @ (change - design @ follows)
     turned = np.swapaxes(signature, 1, 2)
     products, accepted = turned @ signature, np.ones(len(follows))

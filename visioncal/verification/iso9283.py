@@ -136,7 +136,7 @@ def attained_by(session: Session, calibration: Calibration) -> Attained:
         x, z = seen.prior.state.edges[:2]
         poses, device = x @ seen.read, session.instruments[""].name or "instrument"
         views = tuple(by_number[number] for number in seen.views)
-        local, has_rotation = seen.own[:, :, None] * np.eye(6), len(seen.axes) == 6
+        local, has_rotation = seen.reading_variances[:, :, None] * np.eye(6), len(seen.axes) == 6
         by_frames = np.concatenate(
             [adjoint(invert(seen.read)), -np.tile(np.eye(6), (len(views), 1, 1))], axis=2
         )
@@ -145,7 +145,7 @@ def attained_by(session: Session, calibration: Calibration) -> Attained:
         prior = CalibrationPrior.of(calibration)
         stops = predict_stops(session, prior)
         problem, (x, z) = stops.problem, prior.state.edges[:2]
-        measured, own = problem.measured(prior.state), problem.observations.covariance
+        measured, covariance = problem.measured(prior.state), problem.observations.covariance
         if session.mount == "eye-in-hand":
             poses = z @ invert(measured) @ invert(x)
             turn = adjoint(x @ measured)
@@ -155,7 +155,7 @@ def attained_by(session: Session, calibration: Calibration) -> Attained:
             turn = np.tile(adjoint(z), (len(measured), 1, 1))
             by_frames = np.concatenate([adjoint(z @ invert(measured)), -turn], axis=2)
         local, tool, device, has_rotation = (
-            turn @ own @ np.swapaxes(turn, 1, 2),
+            turn @ covariance @ np.swapaxes(turn, 1, 2),
             np.eye(4),
             "camera",
             True,
@@ -240,7 +240,7 @@ def _pose(name: str, seen: Attained, rows: IntArray) -> PosePerformance:
     noise = seen.noise[rows].mean(axis=0)
     away = np.linalg.norm(moves, axis=1)
     spread = moves.T @ moves / (count - 1)
-    low, value, high, alone = _repeatability(spread, noise[3:, 3:], count)
+    low, value, high, device_rp = _repeatability(spread, noise[3:, 3:], count)
     # The mean's own error, and that of the frames.
     frames = seen.frames[rows].mean(axis=0)
     by_frames = frames @ seen.covariance @ frames.T
@@ -253,17 +253,19 @@ def _pose(name: str, seen: Attained, rows: IntArray) -> PosePerformance:
         accuracy_mm=_scaled(1e3, accuracy),
         repeatability_mm=_scaled(1e3, (value, low, high)),
         measured_repeatability_mm=1e3 * float(away.mean() + 3.0 * away.std(ddof=1)),
-        device_mm=1e3 * alone,
+        device_mm=1e3 * device_rp,
         **_over_time(seen, rows),
     )
     if not seen.has_rotation:
         return found
     off_rad = log(mean @ invert(seen.commanded[rows[0]]))[:3]
     sigmas = np.sqrt(np.diag(by_frames)[:3] + turns.var(axis=0, ddof=1) / count)
-    own = np.diag(noise)[:3].tolist()
+    device_variances = np.diag(noise)[:3].tolist()
     turned = [
         _repeatability(np.diag([square, 0, 0]), np.diag([of_device, 0, 0]), count, single=True)
-        for square, of_device in zip(turns.var(axis=0, ddof=1).tolist(), own, strict=True)
+        for square, of_device in zip(
+            turns.var(axis=0, ddof=1).tolist(), device_variances, strict=True
+        )
     ]
     degrees = float(np.rad2deg(1.0))
     return replace(
@@ -286,14 +288,19 @@ def _repeatability(
     The trace follows a chi-square whose degrees of freedom are those of the spread's shape
     (Satterthwaite 1946); RP over its root is that of a normal distribution of this shape.
     """
-    trace, own = float(np.trace(spread)), float(np.trace(noise))
+    trace, noise_trace = float(np.trace(spread)), float(np.trace(noise))
     freedom = (count - 1) * trace**2 / max(float(np.sum(spread**2)), 1e-30)
     low, high = (freedom / chi2_limit(1.0 - end, freedom) for end in _ENDS[::-1])
     shape = 3.0 if single else _shape(spread)
     # A spread below the device's noise, by chance, bounds no better than that noise.
-    parts = (low * trace, trace, high * max(trace, own))
-    ends = [shape * float(np.sqrt(max(part - own, 0.0))) for part in parts]
-    return ends[0], ends[1], ends[2], (3.0 if single else _shape(noise)) * float(np.sqrt(own))
+    parts = (low * trace, trace, high * max(trace, noise_trace))
+    ends = [shape * float(np.sqrt(max(part - noise_trace, 0.0))) for part in parts]
+    return (
+        ends[0],
+        ends[1],
+        ends[2],
+        (3.0 if single else _shape(noise)) * float(np.sqrt(noise_trace)),
+    )
 
 
 def _shape(spread: FloatArray) -> float:

@@ -53,7 +53,7 @@ class PredictedReadings:
     # (m, 6, k) right perturbations of the predicted pose by the frames and the arm's errors.
     by_prior: FloatArray
     by_flange: FloatArray  # (m, 6, 6) the same by the flange.
-    own: FloatArray  # (m, 6) variances of the instrument.
+    reading_variances: FloatArray  # (m, 6) variances of the instrument.
     flange: FloatArray  # (6,) variances of the flange from stop to stop.
 
     @property
@@ -68,8 +68,8 @@ class PredictedReadings:
         shared = np.einsum("mik,njk->minj", by_flange, by_flange)
         shared *= (self.stops[:, None] == self.stops)[:, None, :, None]
         count = len(self.views) * len(self.axes)
-        own = np.diag(self.own[:, self.axes].ravel())
-        return np.asarray(shared.reshape(count, count) + own)
+        independent = np.diag(self.reading_variances[:, self.axes].ravel())
+        return np.asarray(shared.reshape(count, count) + independent)
 
 
 def predict_readings(session: Session, calibration: Calibration) -> PredictedReadings:
@@ -118,15 +118,15 @@ def predict_readings(session: Session, calibration: Calibration) -> PredictedRea
     axes = np.arange(0 if readings.are_poses else 3, 6)
     if readings.are_poses:
         read = np.array([view.instrument_from_probe() for view in used])
-    own = np.zeros((len(q), 6))
-    own[:, :3] = (readings.instrument.sigma_rad or 0.0) ** 2
-    own[:, 3:] = readings.instrument.sigmas_m(read[:, :3, 3])[:, None] ** 2
+    variances = np.zeros((len(q), 6))
+    variances[:, :3] = (readings.instrument.sigma_rad or 0.0) ** 2
+    variances[:, 3:] = readings.instrument.sigmas_m(read[:, :3, 3])[:, None] ** 2
     noise = np.repeat(prior.noise(from_corners=True).robots[0] ** 2, 3)
     names = [str(stop_of[view.number]) for view in used]
     stops = np.unique(names, return_inverse=True)[1]
     return PredictedReadings(
         *(prior, tuple(view.number for view in used), stops, q, loads, read, predicted, axes),
-        *(np.concatenate(parts, axis=2), by_flange, own, noise),
+        *(np.concatenate(parts, axis=2), by_flange, variances, noise),
     )
 
 

@@ -231,11 +231,13 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
     values, words = np.append(log(invert(prior.state.edges) @ edges)[moved], offset), []
     for at, cause in enumerate(chosen):
         part = slice(6 * at, 6 * at + len(cause.units))
-        own = replace(found, values=values[part], covariance=found.covariance[part, part])
+        single_change = replace(found, values=values[part], covariance=found.covariance[part, part])
         (side,) = along(old, [cause.name])
         by = pose_difference(np.eye(4), flange_moved if side == MOUNT else base_moved)
-        alone = change_words(check, PossibleChange(cause, 1.0, own))
-        words.append(alone if cause.name in causes else f"the {side} moved by {mm_and_deg(*by)}")
+        cause_words = change_words(check, PossibleChange(cause, 1.0, single_change))
+        words.append(
+            cause_words if cause.name in causes else f"the {side} moved by {mm_and_deg(*by)}"
+        )
     return replace(new, frames=frames), "; ".join(words)
 
 

@@ -85,10 +85,10 @@ def scene_moves(
         progress("audit", number, last)
         first = int(ends[number]) - episode.count
         for at in np.unique(np.linspace(0, episode.count - 1, looks).round().astype(int)).tolist():
-            image, here = image_at(first + at), first + at
+            image, current = image_at(first + at), first + at
             if reference is None:
                 reference = None if compared(image, image).reason else image
-                places = [here]
+                places = [current]
                 continue
             found = compared(reference, image)
             if not found.reason:
@@ -96,11 +96,11 @@ def scene_moves(
                 used, lost = used + 1, []
             else:
                 # An image that agrees with others that are lost shows another part of the scene.
-                lost.append(here)
+                lost.append(current)
                 is_there = len(lost) >= 3 and not compared(image_at(lost[0]), image).reason
                 if not is_there:
                     continue
-            places.append(here)
+            places.append(current)
             if watch.holds and not lost:
                 continue
             half = 0.5 * float(np.linalg.norm(found.turn / unit)) if not found.reason else np.inf
@@ -109,7 +109,7 @@ def scene_moves(
             begin = int(ends[index]) - episodes[index].count
             yield SceneMove(episodes[index], frame - begin, found)
             reference, watch = image, SceneWatch(unit, steady_px, false_alarm_looks)
-            places, lost, used = [here], [], used + 1
+            places, lost, used = [current], [], used + 1
     if used < 2:
         raise DataError(
             f"{used} frames of {last} episodes could be compared with an earlier one, "

@@ -110,10 +110,10 @@ class SceneWatch:
         scores = np.einsum("kij,kj->ki", weights, self._turns)
         information, score = np.zeros_like(weights), np.zeros_like(scores)
         for group, prior in self._priors.items():
-            own = self._groups == group
+            in_group = self._groups == group
             # Of the looks from c on, for every c.
-            after = np.cumsum((weights * own[:, None, None])[::-1], axis=0)[::-1]
-            by_after = np.cumsum((scores * own[:, None])[::-1], axis=0)[::-1]
+            after = np.cumsum((weights * in_group[:, None, None])[::-1], axis=0)[::-1]
+            by_after = np.cumsum((scores * in_group[:, None])[::-1], axis=0)[::-1]
             gain = after @ np.linalg.inv(prior + after[0])
             information += after - gain @ after
             score += by_after - gain @ by_after[0]

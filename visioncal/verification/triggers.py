@@ -61,7 +61,7 @@ def triggers_of(
         Trigger("collision", "fired" if collision else "quiet", "a collision"),
     ]
     for quantity, (label, usual, unit, column) in _LIMITS.items():
-        limit = usual if (own := limits.get(quantity)) is None else own
+        limit = usual if (stated := limits.get(quantity)) is None else stated
         found = (
             _change(session, calibration, column)
             if column

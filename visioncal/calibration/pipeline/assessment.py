@@ -173,7 +173,7 @@ def assess_fit(
     beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
     if cell_fit.has_links and (between := between_boards_and_arm(fit, cell.session.boards)).any():
         beside[BOARD_OR_ARM] = between
-    fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, beside=beside)
+    fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, by_source=beside)
     held_out = left_out(cell_fit)
     (faults, reasons, marginal), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(

@@ -66,7 +66,7 @@ def _covariances_of_edges(cell_fit: CellFit, fit: Fit) -> dict[str, FloatArray]:
     """Covariances (6 e, 6 e) of the unknown frames, by source and as a `total`."""
     parts = covariance_by_source(fit.problem, fit.state, fit.noise, _sources(cell_fit, fit))
     at = fit.unknowns.of_kinds(EDGE)
-    parts |= {name: array[np.ix_(at, at)] for name, array in fit.beside.items()}
+    parts |= {name: array[np.ix_(at, at)] for name, array in fit.by_source.items()}
     return parts | {"total": sum(parts.values(), np.zeros((len(at), len(at))))}
 
 

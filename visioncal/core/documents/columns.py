@@ -88,12 +88,14 @@ class NumberChecks:
             names = [name for name in group if name in self.values]
             if not names:
                 continue
-            there = np.isfinite([self.values[name] for name in names]).T
+            is_filled = np.isfinite([self.values[name] for name in names]).T
             is_ragged = (
-                there[:, 1:] > there[:, :-1] if group is first_only else there != there[:, :1]
+                is_filled[:, 1:] > is_filled[:, :-1]
+                if group is first_only
+                else is_filled != is_filled[:, :1]
             )
             # Three numbers of a rotation stand in the columns of a quaternion.
-            filled = [bool(column.any()) for column in there.T]
+            filled = [bool(column.any()) for column in is_filled.T]
             is_other = names[-1] == "qw" and all(filled[:-1]) and not filled[-1]
             for row in np.flatnonzero(is_ragged.any(axis=1) & ~wrong).tolist():
                 words = "some are empty and others filled; a row fills all of them or none"
@@ -195,11 +197,11 @@ def _unit_step(names: Sequence[str], numbers: FloatArray, norms: FloatArray) -> 
     squares = np.clip(numbers[:, known], -1e100, 1e100) ** 2
     choices = [[0, 1, 2, 3], [0], [1], [2], [3]] if known.sum() >= FEWEST_COMPARED else []
     for chosen in choices:
-        # Those beside it are a part of a quaternion's square.
+        # The other components are a part of a quaternion's square.
         rest = np.maximum(1.0 - np.delete(squares, chosen, axis=0).sum(axis=0), 0.0)
-        mine = squares[chosen].sum(axis=0)
-        factor = float(np.sqrt(mine.sum() / max(rest.sum(), NORM_TOLERANCE)))
-        away = np.abs(mine / max(factor, NORM_TOLERANCE) ** 2 - rest).max()
+        chosen_squares = squares[chosen].sum(axis=0)
+        factor = float(np.sqrt(chosen_squares.sum() / max(rest.sum(), NORM_TOLERANCE)))
+        away = np.abs(chosen_squares / max(factor, NORM_TOLERANCE) ** 2 - rest).max()
         if rest.max() > 10.0 * NORM_TOLERANCE and away < 2.0 * NORM_TOLERANCE:
             which = ", ".join(names[at] for at in chosen)
             return f"Divide {which} by {factor:.6g} in all rows: then all norms are 1."

@@ -227,11 +227,11 @@ def _numbers(text: str, forms: tuple[str, ...]) -> _PendantNumbers | None:
 
 def _named(line: str) -> _PendantNumbers | None:
     entries = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
-    there = [name for name, _, _ in entries]
+    entry_names = [name for name, _, _ in entries]
     for names in _NAMED_ROTATIONS:
         needed = ("x", "y", "z", *names)
         # Two poses in a line are ambiguous.
-        if any(there.count(name) != 1 for name in needed):
+        if any(entry_names.count(name) != 1 for name in needed):
             continue
         cells = {name: (number, unit) for name, number, unit in entries}
         lengths = {cells[name][1] for name in "xyz"} - {None}

@@ -209,9 +209,12 @@ def _below_titles(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tu
     if len(rows) > 2 and len(rows[0][1]) == len(units := rows[1][1]):
         plain = [unit.strip("[]()-") for unit in units]
         if any(plain) and all(map(_UNIT.fullmatch, plain)):
-            both = zip(rows[0][1], plain, strict=True)
+            titles = zip(rows[0][1], plain, strict=True)
             return [
-                (rows[0][0], tuple(f"{name} [{unit}]" * bool(unit) or name for name, unit in both)),
+                (
+                    rows[0][0],
+                    tuple(f"{name} [{unit}]" * bool(unit) or name for name, unit in titles),
+                ),
                 *rows[2:],
             ]
     return rows

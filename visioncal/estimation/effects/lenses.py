@@ -221,9 +221,9 @@ class LinearisedCorners:
         moves = np.zeros((len(self.views), 6, len(self.free)))
         for name, compressed in zip(self.camera_parameters.problems, self.compressed, strict=True):
             places = self.camera_parameters.places(name)
-            own = np.isin(self.free, places)
-            columns = np.searchsorted(places, self.free[own])
-            moves[self.camera_parameters.rows(name), :, own] = compressed.by_shared[:, :, columns]
+            kept = np.isin(self.free, places)
+            columns = np.searchsorted(places, self.free[kept])
+            moves[self.camera_parameters.rows(name), :, kept] = compressed.by_shared[:, :, columns]
         return moves
 
     @property
@@ -234,8 +234,8 @@ class LinearisedCorners:
     @property
     def by_field(self) -> FloatArray:
         """Jacobian (v, 6, m) of all views' poses by the coefficients of lens errors."""
-        own = [compressed.by_field for compressed in self.compressed]
-        flat = block_diag(*(array.reshape(6 * len(array), array.shape[2]) for array in own))
+        by_camera = [compressed.by_field for compressed in self.compressed]
+        flat = block_diag(*(array.reshape(6 * len(array), array.shape[2]) for array in by_camera))
         return np.asarray(flat.reshape(len(self.views), 6, flat.shape[1]))
 
     def effect(self, rows: IntArray) -> Effect:

@@ -39,6 +39,6 @@ class FocusJitter(LensEffect):
         del distances
         found = self.none(moments)
         known = np.flatnonzero(np.isin(moments.stops, self.stops))
-        own = np.searchsorted(self.stops, moments.stops[known])
-        found[known, :2, own] = self.lens.matrix[:2]
+        stop_columns = np.searchsorted(self.stops, moments.stops[known])
+        found[known, :2, stop_columns] = self.lens.matrix[:2]
         return found

@@ -82,8 +82,8 @@ class PostureEffect(Effect):
 
 def twists_of_frames(poses: FloatArray) -> FloatArray:
     """(k, 6, 12) twists of (k, 4, 4) flanges by those of their base, and by their own."""
-    own = np.broadcast_to(np.eye(6), (len(poses), 6, 6))
-    return np.concatenate([adjoint(invert(poses)), own], axis=2)
+    by_flange = np.broadcast_to(np.eye(6), (len(poses), 6, 6))
+    return np.concatenate([adjoint(invert(poses)), by_flange], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,13 +65,13 @@ class _AlongMotion(Effect, Named):
 def _between(poses: FloatArray, seen_from: FloatArray) -> FloatArray:
     """(n - 1, 3, 6) motions from each of (n, 4, 4) poses to the next.
 
-    In the frame of the (n - 1, 4, 4) one at which they are looked at.
+    Motions are in the frame of the (n - 1, 4, 4) pose from which they are seen.
     """
     screws, shifts = log(invert(poses[:-1]) @ poses[1:]), np.diff(poses[:, :3, 3], axis=0)
     along = np.einsum("nji,nj->ni", seen_from[:, :3, :3], shifts)
-    beside = np.append(np.zeros_like(along), screws[:, 3:] - along, axis=1)
+    across = np.append(np.zeros_like(along), screws[:, 3:] - along, axis=1)
     places = np.append(np.zeros_like(along), along, axis=1)
-    return np.stack([screws - beside, beside, places], axis=1)
+    return np.stack([screws - across, across, places], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
