@@ -626,6 +626,7 @@ def test_a_wrong_stated_lens_makes_no_smaller_pictures(focal):
     assert "image_sizes" not in {each.kind for each in found.verdict.causes}
 
 
+@pytest.mark.slow
 def test_sizes_that_are_no_listed_share_are_not_named():
     """800 x 600 px of 1280 x 960: neither 0.6 nor 2/3 of it."""
     robot, seen = corners_of(MOUNTS[0])

@@ -1542,7 +1542,7 @@ def test_pictures_of_the_lens_do_not_change_pairs_that_do_not_fit(tmp_path):
     )
 
 
-@pytest.mark.parametrize("source", ["in.npz", "in/", "./in", "run.1", "."])
+@pytest.mark.parametrize("source", ["in.npz", *map(slow, ("in/", "./in")), "run.1", "."])
 def test_pictures_within_arrays_come_in_by_the_printed_command(tmp_path, monkeypatch, source):
     """Files beside without pictures are kept; masks before the pictures are none."""
     monkeypatch.chdir(tmp_path)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal
+from support.marks import slow
 from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
@@ -67,7 +68,7 @@ MISREAD = {
 }
 
 
-@pytest.mark.parametrize("name", MISREAD)
+@pytest.mark.parametrize("name", ["millimetres", slow("w first")])
 def test_poses_that_are_misread_are_no_change_of_the_cell(taken, name, tmp_path):
     calibration, later, _ = taken
     change, words = MISREAD[name]
