@@ -329,6 +329,7 @@ def test_a_base_that_creeps_before_a_fixed_camera_is_among_what_is_named(seed, t
     assert cause.kind == "base_creeps" or verdict.top[0].startswith("Likeliest of these")
 
 
+@pytest.mark.slow
 def test_a_lens_that_was_zoomed_far_is_not_one_that_varies(tmp_path):
     """By 4 % midway: beside errors that last, it gains less than one that varies does alone."""
 

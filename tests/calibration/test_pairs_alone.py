@@ -241,6 +241,7 @@ def test_rows_that_are_shifted_are_counted_by_the_stops_of_their_robot(tmp_path,
     assert re.search(r"--shift \d+-19:-2", cause.do.command)
 
 
+@pytest.mark.slow
 def test_a_rail_with_a_column_is_added_to_all_rows_of_its_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cell = stereo(tmp_path / "cell")

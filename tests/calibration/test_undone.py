@@ -213,6 +213,7 @@ PLANTED = {
 
 # Another one is found by the same.
 ALIKE = [
+    "shifted_rows",
     "copied_poses of the target",
     "mixed_units of angles ",
     "mixed_units of angles ZYX",

@@ -679,7 +679,8 @@ ALIKE = {
     "lifted", "links off by little", "poses read on the way", "printed longer along one axis",
     "rectified midway", "size within what is stated", "sound to hand", "sound",
     "stops err in groups", "views left out after a bump", "wavy lens before lone tags",
-    "knocked by little", "knocked twice", "exchanged rows", "size contradicted", "wrong arm",
+    "knocked by little", "knocked twice", "exchanged rows", "lens hit midway", "size contradicted",
+    "wrong arm",
     "weak motion", "wrong arm with joints", "wrong views",
 }  # fmt: skip
 
