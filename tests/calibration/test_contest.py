@@ -9,7 +9,6 @@ import pytest
 from benchmarks import elsewhere
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated, pairs_session, reporting
-from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.sound_findings import SOUND, changed, directions
@@ -145,7 +144,7 @@ def test_a_camera_that_moved_twice_is_named_with_the_frame_of_either_change():
     ("by", "share", "words"),
     [
         (-1, 0.006, "the image was taken before the arm had arrived, as of commanded poses"),
-        slow(-1, -0.01, "the pose was read before the arm had arrived"),
+        (-1, -0.01, "the pose was read before the arm had arrived"),
         (1, 0.008, "the image was taken once the arm had left"),
     ],
 )

@@ -679,9 +679,8 @@ ALIKE = {
     "lifted", "links off by little", "poses read on the way", "printed longer along one axis",
     "rectified midway", "size within what is stated", "sound to hand", "sound",
     "stops err in groups", "views left out after a bump", "wavy lens before lone tags",
-    "knocked by little", "knocked twice", "exchanged rows", "lens hit midway", "size contradicted",
-    "wrong arm",
-    "weak motion", "wrong arm with joints", "wrong views",
+    "knocked by little", "knocked twice", "lens hit midway", "weak motion",
+    "wrong arm with joints", "wrong views",
 }  # fmt: skip
 
 
@@ -719,7 +718,7 @@ def test_the_error_of_a_world_is_named_and_its_sigmas_hold(name):
         slow(partial(stretched, axis=0), "x_stretches", np.array([3e-3])),
         (stretched, "y_stretches", np.array([3e-3])),
         slow(partial(stretched, axis=2), "z_stretches", np.array([3e-3])),
-        slow(skewed, "axes_skew", np.array([2e-3, 0.0, 0.0])),
+        (skewed, "axes_skew", np.array([2e-3, 0.0, 0.0])),
         (grown, "arm_grows", np.array([1e-3])),
         slow(crept, "base_creeps", np.pad(-CREEP_M, (3, 0))),
         slow(turned_beside, "base_creeps", None),
@@ -729,7 +728,7 @@ def test_the_error_of_a_world_is_named_and_its_sigmas_hold(name):
         slow(short, "stops_short", None),
         (short_of_lines, "stops_short", np.array([-0.01, 0.0, 0.0, 0.0, 0.0, 0.0])),
         slow(short_of_places, "stops_short", np.array([0.0, 0.0, 0.0, 0.0, 0.0, -2e-3])),
-        slow(onwards, "moves_on", None),
+        (onwards, "moves_on", None),
     ],
 )
 def test_an_error_that_grows_is_named_recovered_and_in_the_budget(change, kind, true):
