@@ -282,6 +282,7 @@ def test_the_digest_sees_facts_and_not_their_spelling(folder, tmp_path):
 TOML_REFUSALS = [
     ("schema = 1", "schema = 2", "schema is 2, but must be 1"),
     ("schema = 1\n", "", "schema is missing, but must be 1"),
+    ("schema = 1\n", 'schema = "1"\n', "schema is '1', but must be 1"),
     ('name = "bench"\n', "", "name is missing"),
     ('"eye-in-hand"', '"hand"', "mount is 'hand', but must be .eye-in-hand. or .eye-to-hand."),
     ("1280, 800", "1280, -800", r"camera\.resolution\[1\] is -800, but must be a whole number"),
@@ -387,6 +388,7 @@ CSV_REFUSALS = [
     ("0.6,0,0.3", "0.6,,0.3", r"line 3, column x_m \.\.\. qw: some are empty"),
     ("0.6,0,0,0.8", "0.6,0,0,0.9", r"line 3, column qx \.\.\. qw: .*norm is 1\.08167, but must"),
     ("0.6,0,0,0.8,", "0.6,0,0,0.8", "line 3: it has 12 fields, but the header has 13 columns"),
+    ("1e-1,0.6,0,0.3", "1e-1,0,6,0,0.3", "14 fields, .* 0,6 is two fields: write 0.6"),
     ("images\\b 2.png", "..\\b.png", "line 3, column image: the path .* leaves the session"),
     ("images\\b 2.png", "", "line 3, column image: it is empty, and the row has neither"),
     ('"first, ""dark"""', '"first', r"views\.csv, line 2"),

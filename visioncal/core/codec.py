@@ -256,7 +256,7 @@ def read_value(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what 
     """Reads a value of a type; `MISSING` is refused; the errors are those of `read`."""
     origin, args = get_origin(kind), get_args(kind)
     if value is MISSING:
-        raise DataError(f"{path} is missing, but must be {needed_of(kind)}.", culprits=[path])
+        raise _missing(kind, path)
     if kind is Any:
         return value
     if origin is Annotated:
@@ -275,13 +275,22 @@ def read_value(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what 
     return plain(kind, value, path)
 
 
+def _missing(kind: Any, path: str) -> DataError:  # noqa: ANN401 - see `read_value`
+    """Builds the error for a value that is absent; of an only name, with the line to add."""
+    inner = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    names = get_args(inner) if get_origin(inner) is Literal else ()
+    step = f"Add {path} = {names[0]!r}." if len(names) == 1 else ""
+    words = f"{path} is missing, but must be {needed_of(kind)}."
+    return DataError(words, culprits=[path], next_step=step)
+
+
 def _one_of(names: Sequence[Any], value: object, kind: Any, path: str) -> Any:  # noqa: ANN401
     """The name that a value is: `True` is no 1, and a text of another class is a text."""
     for name in names:
         is_same_kind = isinstance(value, bool) == isinstance(name, bool)
         if is_same_kind and isinstance(value, type(name)) and value == name:
             return name
-    raise wrong_value(value, needed_of(kind), path, _similar(value, names))
+    raise wrong_value(value, needed_of(kind), path, _similar(value, names) or _unquoted(value))
 
 
 def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see `read_value`
@@ -395,7 +404,7 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
     """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
-        raise wrong_value(value, needed_of(kind), path)
+        raise wrong_value(value, needed_of(kind), path, _unquoted(value) if kind is not str else "")
     try:
         return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
     except OverflowError as error:
@@ -405,6 +414,14 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
 def _similar(value: object, names: Collection[Any]) -> str:
     texts = [name for name in names if isinstance(name, str)]
     return did_you_mean(value, texts) if isinstance(value, str) else ""
+
+
+def _unquoted(value: object) -> str:
+    """Advice on a number that is written as a text."""
+    try:
+        return f"Write it without quotes: {float(value):g}." if isinstance(value, str) else ""
+    except ValueError:
+        return ""
 
 
 def wrong_value(value: object, needed: str, path: str, next_step: str = "") -> DataError:

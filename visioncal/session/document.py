@@ -18,14 +18,16 @@ from visioncal.core.types import Camera, CameraKind, CameraMount, FloatArray, Ne
 
 # Limit that keeps squares and products from overflowing.
 _LARGEST = 1e15
-Number = Annotated[float, Check("a finite number", lambda value: abs(value) <= _LARGEST)]
+Number = Annotated[float, Check("a finite number up to 1e15", lambda value: abs(value) <= _LARGEST)]
 # Plausible standard deviations of a focal length [px].
 PixelSigma = Annotated[float, within(1e-3, 1e4)]
 # Standard deviations of measured lengths [m] and angles [rad]: the least is a tenth of what the
 # best measuring machines reach. Beside smaller ones nothing is left of the images' information.
 MeasuredSigma = Annotated[float, within(1e-7, _LARGEST)]
 NotNegative = Annotated[float, within(0.0, _LARGEST)]
-Positive = Annotated[float, Check("a number above 0", lambda value: 0.0 < value <= _LARGEST)]
+Positive = Annotated[
+    float, Check("a number above 0 and up to 1e15", lambda value: 0.0 < value <= _LARGEST)
+]
 # Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, within(1, 65_535)]
 

@@ -16,6 +16,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import READ_AGAIN
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+# A number with a decimal comma, which parts it between commas.
+_PARTED = re.compile(r"\s*[+-]?[0-9]+,[0-9]+\s*")
 # Lines of a message at most.
 _SHOWN = 10
 
@@ -148,7 +150,21 @@ class TableReader(NumberChecks):
             if len(row) != width:
                 words = f"it has {len(row)} fields, but the header has {width} columns"
                 # Before the problems of the next row that is read.
-                self._problems.append((following, TableProblem(table.place(at), words)))
+                problem = TableProblem(table.place(at), f"{words}{self._parted_words(row)}")
+                self._problems.append((following, problem))
+
+    def _parted_words(self, row: Sequence[str]) -> str:
+        """Words on a number whose decimal comma parts a row that is too long; empty without one."""
+        for cells, whole, decimals in zip(self.cells.values(), row, row[1:], strict=False):
+            is_decimal = any("." in cell for cell in cells)
+            if (
+                len(row) > len(self.cells)
+                and is_decimal
+                and _PARTED.fullmatch(f"{whole},{decimals}")
+            ):
+                number = f"{whole.strip()},{decimals.strip()}"
+                return f"; {number} is two fields: write {number.replace(',', '.')}"
+        return ""
 
     def texts(self, name: str) -> list[str]:
         """(count,) cells of a column, without surrounding blanks; empty where there is none."""
