@@ -99,7 +99,7 @@ def calibrate(
         DegenerateError: The motion leaves a direction of the result undetermined.
         ConvergenceError: The intrinsics do not converge.
     """
-    asked = CalibrationOptions(
+    options = CalibrationOptions(
         solver=solver,
         level=level,
         convention=convention,
@@ -107,7 +107,7 @@ def calibrate(
         threads=threads,
         dense=dense,
     )
-    state = initial_state(session, **asked)
+    state = initial_state(session, **options)
     with_need = state.session.needing(need_mm, need_deg, corrected=corrected)
     state = replace(state, session=with_need, given_corners=corners)
     if _sees_points(state):
@@ -116,9 +116,9 @@ def calibrate(
     return _with_depth(state)[0] if _has_depth(state) else result_of(state)
 
 
-def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> Run:
+def run(session: Session | Path | str, **options: Unpack[CalibrationOptions]) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
-    state = initial_state(session, **asked)
+    state = initial_state(session, **options)
     if _sees_points(state):
         return _points_run(state)
     state = run_stages(state)
@@ -193,9 +193,9 @@ def _judge(state: RunState) -> RunState:
 
 def _of_pair(state: RunState, session: Session, corners: Mapping[int, Corners]) -> RunState:
     """The run of one robot, camera and target of a cell, of corners that were detected."""
-    alone = initial_state(session, level=state.level, threads=state.threads or None)
+    pair_state = initial_state(session, level=state.level, threads=state.threads or None)
     seen = corners if session.corner_table is None else None
-    return run_stages(replace(alone, given_corners=seen))
+    return run_stages(replace(pair_state, given_corners=seen))
 
 
 STAGES: tuple[Stage, ...] = (

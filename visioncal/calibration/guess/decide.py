@@ -124,8 +124,10 @@ def guess_reading(
             found = _of_some_rows(recordings[0]) or found
         if mount is None:
             # A reading of another mount is that mount's, as it is declared there.
-            own = [item for item in found if item[1].hypothesis.mount == item[1].recording.mount]
-            found = sorted(own or found, key=lambda item: -_beside_other_mount(item[1]))
+            same_mount = [
+                item for item in found if item[1].hypothesis.mount == item[1].recording.mount
+            ]
+            found = sorted(same_mount or found, key=lambda item: -_beside_other_mount(item[1]))
             _check_mount([best for _, best in found])
         (declared, *others), best = found[0]
         tried = [best, *(item for item in (declared, *others) if item is not best)]
@@ -214,8 +216,8 @@ def _by_joints(candidate: Candidate) -> Fit | None:
     recording = candidate.recording
     if recording.chain is None:
         return None
-    both = recording.robot.present & np.isfinite(recording.chain).all(axis=(1, 2))
-    rows = thinned(np.flatnonzero(both))
+    is_paired = recording.robot.present & np.isfinite(recording.chain).all(axis=(1, 2))
+    rows = thinned(np.flatnonzero(is_paired))
     poses = candidate.hypothesis.robot.poses(recording.robot.rows(rows))
     readable = np.isfinite(poses).all(axis=(1, 2))
     if readable.sum() < FEWEST_ROWS:

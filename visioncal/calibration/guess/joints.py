@@ -85,9 +85,9 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
     for first, second in combinations(range(count), 2):
         order = np.arange(count)
         order[[first, second]] = second, first
-        both = f"q{first + 1}_rad and q{second + 1}_rad"
-        fix = f"Exchange the headings {both} in views.csv (ROS's joint_states sort by name)."
-        yield entry(f"the columns {both} exchanged", fix, same[order], first, second)
+        headings = f"q{first + 1}_rad and q{second + 1}_rad"
+        fix = f"Exchange the headings {headings} in views.csv (ROS's joint_states sort by name)."
+        yield entry(f"the columns {headings} exchanged", fix, same[order], first, second)
     for at, name in enumerate(robot.joint_names):
         fix = f"Negate q{at + 1}_rad, or turn the axis of {name} in the robot's model."
         yield entry(f"q{at + 1}_rad of the opposite sign", fix, np.diag(1.0 - 2.0 * same[at]), at)

@@ -60,8 +60,8 @@ class SideReading(Reading):
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 3, 3) rotations as they are written; NaN where the numbers give none."""
         if self.by_place:
-            there, none = dict(self.by_place), (np.nan,) * 9
-            rows = [there.get(place, none) for place in numbers.places]
+            rotation_of, none = dict(self.by_place), (np.nan,) * 9
+            rows = [rotation_of.get(place, none) for place in numbers.places]
             return np.array(rows).reshape(-1, 3, 3)
         recorded = as_written(numbers, self.written).rotations
         if self.folded:
@@ -306,9 +306,9 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
         return
     forms = [form.rotation.split("-") for form in POSE_FORMS.values()]
     used = sorted({form[1] for form in forms if form[0] == "euler"}, key=str.swapcase)[::-1]
-    # Those that makers use come first: others are the same numbers in another order.
-    both = [] if by_makers else [*map(str.upper, used), *map(str.lower, used)]
-    orders = dict.fromkeys([*used, *both])
+    # Orders that makers use come first: others are the same numbers in another order.
+    cases = [] if by_makers else [*map(str.upper, used), *map(str.lower, used)]
+    orders = dict.fromkeys([*used, *cases])
     degrees = [f"euler-{order}-deg" for order in orders]
     pairs = [*product(degrees, degrees)]
     rotations = form.read(robot.rotations)
@@ -343,12 +343,12 @@ class _Known:
 
     def adds(self, tried: FloatArray) -> bool:
         """Whether (n, 3, 3) rotations are none of these yet, which from then on they are."""
-        own = float(np.nansum(tried * _UNEVEN))
-        near = np.flatnonzero(np.abs(np.array(self._sums) - own) <= 5e-4 * max(len(tried), 1))
+        checksum = float(np.nansum(tried * _UNEVEN))
+        near = np.flatnonzero(np.abs(np.array(self._sums) - checksum) <= 5e-4 * max(len(tried), 1))
         if any(np.allclose(tried, self._rotations[at], atol=1e-9, equal_nan=True) for at in near):
             return False
         self._rotations.append(tried)
-        self._sums.append(own)
+        self._sums.append(checksum)
         return True
 
 

@@ -152,8 +152,8 @@ def chains(
     robot, camera = recording.robot.rows(np.maximum(looked, 0)), recording.camera.rows(rows)
     by_robot = _poses_by({reading.robot for reading in tried}, robot)
     by_camera = _poses_by({reading.camera for reading in tried}, camera)
-    both = zip(tried, at.reshape(of_robot.shape), strict=True)
-    poses = np.array([by_robot[reading.robot][index] for reading, index in both])
+    pairs = zip(tried, at.reshape(of_robot.shape), strict=True)
+    poses = np.array([by_robot[reading.robot][index] for reading, index in pairs])
     outside = np.array([reading.mount == "eye-to-hand" for reading in tried])
     poses[outside] = invert(poses[outside])
     poses[of_robot < 0] = np.nan

@@ -90,15 +90,15 @@ def _row_by_row(recording: Recording, best: Candidate, rows: IntArray) -> Candid
     robot = best.hypothesis.robot
     if not robot.written.startswith("euler") or not best.fit.closes:
         return None
-    both = [replace(robot, folded=folded) for folded in (False, True)]
+    triples = [replace(robot, folded=folded) for folded in (False, True)]
     every = recording.common_rows
     numbers = recording.robot.rows(every)
-    tried = [replace(best.hypothesis, robot=side) for side in both]
+    tried = [replace(best.hypothesis, robot=side) for side in triples]
     chained, seen = chains(recording, tried, every)
     lever, edges = best.fit.lever, (best.fit.x, best.fit.z)
     pairs = zip(chained, seen, strict=True)
     away = np.array([distances(*sides, lever, edges).residuals for sides in pairs])
-    rotations = np.array([side.rotations(numbers) for side in both])
+    rotations = np.array([side.rotations(numbers) for side in triples])
     chosen = rotations[np.nan_to_num(away, nan=np.inf).argmin(axis=0), np.arange(len(every))]
     by_place = tuple(zip(numbers.places, map(tuple, chosen.reshape(-1, 9).tolist()), strict=True))
     side = replace(recording.declared.robot, by_place=by_place)
@@ -199,13 +199,13 @@ def _unwrapped(recording: Recording, *, keep_turns: bool) -> Iterator[Change]:
     numbers = recording.robot.rows(rows)
     poses = declared.robot.poses(numbers)
     seen = declared.camera.poses(recording.camera.rows(rows))
-    there = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
-    sides = poses[there, :3, :3], poses[there, :3, 3], seen[there]
+    is_complete = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
+    sides = poses[is_complete, :3, :3], poses[is_complete, :3, 3], seen[is_complete]
     found = unwrapped(*sides, recording.mount, keep_turns=keep_turns)
     if found is None:
         return
     (taken, form), rotations = found
-    places = (numbers.places[at] for at in np.flatnonzero(there))
+    places = (numbers.places[at] for at in np.flatnonzero(is_complete))
     by_place = zip(places, map(tuple, rotations.reshape(-1, 9).tolist()), strict=True)
     was, other = ROTATION_FORMS[form].words, ROTATION_FORMS[taken].words
     other = "radians" if form.endswith("deg") else other

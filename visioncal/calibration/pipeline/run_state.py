@@ -71,17 +71,17 @@ class RunState(Observed):
     @property
     def cell(self) -> Cell:
         """The cell as the session states it."""
-        return _there(self.cell_or_none, "the cell")
+        return _required(self.cell_or_none, "the cell")
 
     @property
     def cell_fit(self) -> CellFit:
         """The fit of the cell."""
-        return _there(self.cell_fit_or_none, "the fit")
+        return _required(self.cell_fit_or_none, "the fit")
 
     @property
     def assessment(self) -> FitAssessment:
         """The fit with its covariance and diagnosis."""
-        return _there(self.assessment_or_none, "the answer")
+        return _required(self.assessment_or_none, "the answer")
 
     @cached_property
     def uncertainty(self) -> UncertaintyResult:
@@ -108,27 +108,27 @@ class RunState(Observed):
         return tuple(row.view for row, is_used in zip(rows, used, strict=True) if is_used)
 
 
-def _there(value: _T | None, name: str) -> _T:
+def _required(value: _T | None, name: str) -> _T:
     if value is None:
         raise RuntimeError(f"a stage that needs {name} comes before it")
     return value
 
 
-def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> RunState:
+def initial_state(session: Session | Path | str, **options: Unpack[CalibrationOptions]) -> RunState:
     """Loads the session and checks the options: the state before the first stage."""
-    threads, solver = asked.get("threads"), asked.get("solver", "joint")
+    threads, solver = options.get("threads"), options.get("solver", "joint")
     if threads is not None and threads < 1:
         raise DataError(f"threads is {threads}, but must be at least 1.", culprits=["--threads"])
-    check_level(asked.get("level", "auto"))
+    check_level(options.get("level", "auto"))
     state = RunState(
         session if isinstance(session, Session) else Session.load(session),
-        asked.get("progress"),
+        options.get("progress"),
         threads or 0,
-        dense=asked.get("dense", False),
-        pictures=asked.get("pictures", False),
+        dense=options.get("dense", False),
+        pictures=options.get("pictures", False),
         solver=solver,
-        level=asked.get("level", "auto"),
-        convention=asked.get("convention"),
+        level=options.get("level", "auto"),
+        convention=options.get("convention"),
     )
     if state.mount is None and solver != "joint":
         raise DataError(

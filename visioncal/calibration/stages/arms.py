@@ -154,8 +154,8 @@ class RobotArm:
 
     def applied_to(self, problem: Problem) -> Problem:
         """A problem with this arm's poses and effects in place of its former ones."""
-        mine = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
-        rest = [effect for effect in problem.effects if effect.name not in mine]
+        effect_names = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
+        rest = [effect for effect in problem.effects if effect.name not in effect_names]
         return problem.with_poses(self.robot, self.poses).with_effects([*rest, *self.effects()])
 
     def without_errors(self, problem: Problem) -> Problem:
@@ -271,7 +271,7 @@ class RobotArm:
         self,
         problem: Problem,
         start: State,
-        asked: str,
+        level: str,
         views: Sequence[int],
         noise: Noise,
         *,
@@ -286,7 +286,7 @@ class RobotArm:
         q, every = used.joints_rad, self.joints_rad
         if self.matched is None or q is None or every is None or not len(q):
             return self
-        if functions and (HARMONICS not in ASKED[asked] or len(q) < _FEWEST_FOR_FUNCTIONS):
+        if functions and (HARMONICS not in ASKED[level] or len(q) < _FEWEST_FOR_FUNCTIONS):
             return self
         found_levels = []
         for robot in self._hypotheses(used.loads):
@@ -298,15 +298,15 @@ class RobotArm:
             harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
             waves = None if harmonics is None else self.by_stop(harmonics)
             kinematics = select_errors(
-                problem, start, self.robot, bases, model.torque_nm, asked, noise, waves
+                problem, start, self.robot, bases, model.torque_nm, level, noise, waves
             )
             if kinematics is not None:
                 found_levels.append((kinematics, model))
         if not found_levels:
             return self
         kinematics, model = max(found_levels, key=lambda pair: pair[0].fit.gain)
-        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
-        kinematics = replace(kinematics, views=tuple(views[index] for index in mine))
+        arm_rows = np.flatnonzero(rows_of(problem, self.robot)).tolist()
+        kinematics = replace(kinematics, views=tuple(views[index] for index in arm_rows))
         arm = replace(self, kinematics=kinematics)
         if found := kinematics.fit.errors:
             return arm._with_model(model.with_errors(found, kinematics.fit.functions))
@@ -387,7 +387,7 @@ def with_link_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
     }
 
 
-def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
+def check_arms(arms: Mapping[str, RobotArm], level: str) -> None:
     """Refuses a level that the loads cannot give.
 
     Raises:
@@ -395,7 +395,7 @@ def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
     """
     for arm in arms.values():
         robot = arm.matched.robot if arm.matched else None
-        if asked == "elastic" and robot and robot.masses is None and not arm.loads.any:
+        if level == "elastic" and robot and robot.masses is None and not arm.loads.any:
             raise DataError(
                 f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does "
                 "not state the masses of its links, and no view has a payload_kg or a force.",

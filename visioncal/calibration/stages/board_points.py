@@ -196,13 +196,13 @@ def _point_errors(
     # scatters beside the others.
     for _ in range(_ROUNDS):
         stack = replace(stack, weights=weights[stack.ids], zooms=by_view)
-        own, pulls, unknowns = _reduced(stack, columns, smooth)
-        flat = own.reshape(-1, count)
+        by_places, pulls, unknowns = _reduced(stack, columns, smooth)
+        flat = by_places.reshape(-1, count)
         inner = flat.T @ flat
         values, vectors = np.linalg.eigh(inner)
         is_open = values > _OPEN * np.median(values)
         values, vectors = values[is_open], vectors[:, is_open]
-        rows = own @ (vectors / np.sqrt(values))
+        rows = by_places @ (vectors / np.sqrt(values))
         found = np.einsum("nai,na->i", rows, pulls)
         left = pulls - rows @ found
         ratios, scatter = _scatter(stack, left / stack.given_weights[:, None], len(positions))
@@ -293,11 +293,11 @@ def _reduced(
     columns = columns.copy()
     stack.weigh(columns)
     left = WithoutPoses.of(stack, columns[:, :, :6], columns[:, :, 6:], None).left
-    others, own = np.split(left.reshape(2 * len(stack.px), -1), [smooth], axis=1)
+    others, by_places = np.split(left.reshape(2 * len(stack.px), -1), [smooth], axis=1)
     scale = np.linalg.norm(others, axis=0)
     others = others / np.where(scale > 0.0, scale, 1.0)
     squares, vectors = np.linalg.eigh(others.T @ others)
     is_shown = squares > _SHOWN**2 * squares[-1]
     root = others @ (vectors[:, is_shown] / np.sqrt(squares[is_shown]))
-    own = (own - root @ (root.T @ own)).reshape(len(stack.px), 2, -1)
-    return own[:, :, :-1], own[:, :, -1], root.shape[1]
+    by_places = (by_places - root @ (root.T @ by_places)).reshape(len(stack.px), 2, -1)
+    return by_places[:, :, :-1], by_places[:, :, -1], root.shape[1]

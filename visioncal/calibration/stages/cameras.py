@@ -221,8 +221,8 @@ def estimate_lenses(seen: T) -> T:
                 except (ConvergenceError, DegenerateError) as error:
                     # Far boards are flat in their images.
                     lens = _by_motion(seen, frame, error)
-                    alone = f"By its views alone: {error.message} {error.next_step}"
-                    words = f"The robot's motion determined the lens. {alone}"
+                    failure = f"By its views alone: {error.message} {error.next_step}"
+                    words = f"The robot's motion determined the lens. {failure}"
                     seen = replace(seen, notes=(*seen.notes, words))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
@@ -264,14 +264,14 @@ def exchanged_columns(seen: Observed) -> bool:
         return False
     (look,) = seen.cameras.values()
     views = [view for view in seen.session.views if view.number in look.corners]
-    both = [(look.corners[view.number], boards[seen.session.board_of(view)]) for view in views]
+    pairs = [(look.corners[view.number], boards[seen.session.board_of(view)]) for view in views]
     if look.lens is None or look.resolution is None or len(boards) != 1:
         return False
     if look.lens.estimated:
-        return are_exchanged(both, look.resolution, look.lens.camera.matrix[2:])
-    if not both or not are_from_behind(both):
+        return are_exchanged(pairs, look.resolution, look.lens.camera.matrix[2:])
+    if not pairs or not are_from_behind(pairs):
         return False
-    as_given = {at.view: at for at, _ in both}
+    as_given = {at.view: at for at, _ in pairs}
     turned = {view: replace(at, px=at.px[:, ::-1]) for view, at in as_given.items()}
     given_px, turned_px = (
         float(np.median(rms_px(some, tuple(boards.values()), look.lens.camera)))

@@ -63,13 +63,13 @@ class Cell:
 
     def views_of_robot(self, robot: str, stop: int) -> list[int]:
         """The views with a robot's poses from a stop of the session on."""
-        own = (
+        robot_views = (
             view
             for name in self.session.robots
             if robot_key(name) == robot
             for view in rows_of_robot(self.session, name)
         )
-        return [view.number for view in own if stop_of(view) >= stop]
+        return [view.number for view in robot_views if stop_of(view) >= stop]
 
     def or_separately(self, do: str, station: int, note: str = "") -> Remedy:
         """Advice to `do` something and record again, or to calibrate what follows it alone.
@@ -106,8 +106,10 @@ class Cell:
                     ends += [step.frame, self.tree.branches[step.frame].parent]
             pairs |= {(seer, end) for end in ends}
         connected = {_CELL}
-        while beside := {end for pair in pairs if connected & {*pair} for end in pair} - connected:
-            connected |= beside
+        while (
+            neighbours := {end for pair in pairs if connected & {*pair} for end in pair} - connected
+        ):
+            connected |= neighbours
         return tuple(branch for branch in self.tree.branches if branch in connected)
 
     def with_reference(self, reference: str) -> "Cell":

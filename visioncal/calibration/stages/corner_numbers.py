@@ -52,8 +52,8 @@ def usable_corners(
     """
     corners = {view.number: session.corners[view.number] for view in views}
     outside = {view: far_outside(at.px, resolution) for view, at in corners.items()}
-    both = [(corners[view.number], session.boards[session.board_of(view)]) for view in views]
-    if are_exchanged(both, resolution):
+    pairs = [(corners[view.number], session.boards[session.board_of(view)]) for view in views]
+    if are_exchanged(pairs, resolution):
         raise OtherBoardError.of(
             Finding(
                 "corner_numbers",
@@ -79,9 +79,11 @@ def usable_corners(
         )
     usable = dict[int, Corners | Rejection]()
     for name, target in session.boards.items():
-        mine = [corners[view.number] for view in views if session.board_of(view) == name]
-        usable |= {at.view: _usable(at, target, outside[at.view], resolution) for at in mine}
-        numbered = [at for at in mine if isinstance(usable[at.view], Corners)]
+        board_corners = [corners[view.number] for view in views if session.board_of(view) == name]
+        usable |= {
+            at.view: _usable(at, target, outside[at.view], resolution) for at in board_corners
+        }
+        numbered = [at for at in board_corners if isinstance(usable[at.view], Corners)]
         for view in _misnumbered(session, name, numbered):
             usable[view] = Rejection(
                 view, "its corners in corners.csv do not lie as the target's drawing numbers them"
@@ -109,8 +111,8 @@ def are_exchanged(
         return bool(size[0] > size[1])
     if centre_px is None:
         return False
-    here, there = (np.linalg.norm(at - size / 2) for at in (centre_px, centre_px[::-1]))
-    return bool(CLEAR_RATIO * there < here)
+    given_px, exchanged_px = (np.linalg.norm(at - size / 2) for at in (centre_px, centre_px[::-1]))
+    return bool(CLEAR_RATIO * exchanged_px < given_px)
 
 
 def _usable(

@@ -125,10 +125,10 @@ def _scaled_by(
     lens, sigma_px = known.camera, floored_sigma_px(known.sigma_px)
     given, scaled = (rms_px(corners, targets, lens, by) for by in (1.0, 1.0 / share))
     # By the noise of a corner in its own picture.
-    own, counts = share * scaled, np.array([len(at.ids) for at in corners.values()])
+    picture_px, counts = share * scaled, np.array([len(at.ids) for at in corners.values()])
     is_known = np.isfinite(given) & np.isfinite(scaled)
-    excess = np.subtract(given**2, own**2, out=np.zeros(len(given)), where=is_known)
-    fits = is_known & (own < _UNEVEN * sigma_px) & (given > _UNEVEN * scaled)
+    excess = np.subtract(given**2, picture_px**2, out=np.zeros(len(given)), where=is_known)
+    fits = is_known & (picture_px < _UNEVEN * sigma_px) & (given > _UNEVEN * scaled)
     fits &= 2.0 * counts * excess > _CLEAR_CHI2 * sigma_px**2
     # Clear views determine the share, by which less clear ones are of it, too.
     clear = fits & (given > (CLEAR_RATIO if fits.sum() > 1 else _CLEAR_ALONE) * scaled)

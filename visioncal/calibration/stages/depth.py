@@ -55,8 +55,10 @@ def fit_mixed(
     """
     table = np.column_stack([fixed, known, views, excess]) / noise[:, None]
     count = table.shape[1] - 1
-    _, randoms, own = np.split(np.arange(count), np.cumsum([fixed.shape[1], known.shape[1]]))
-    groups = ((-1, randoms), (1, own[::3]), (2, np.delete(own, np.s_[::3])))
+    _, randoms, view_columns = np.split(
+        np.arange(count), np.cumsum([fixed.shape[1], known.shape[1]])
+    )
+    groups = ((-1, randoms), (1, view_columns[::3]), (2, np.delete(view_columns, np.s_[::3])))
     terms = [prior_term(size, of, np.zeros(len(of)), 1.0) for size, of in groups]
     every = Term(0, len(table), np.arange(count), table.T @ table)
     mixed = Mixed((every, *terms), (), count, 3)

@@ -77,21 +77,21 @@ class Sensor:
     @classmethod
     def of(cls, pair: Calibration, session: Session, camera: str, board: str) -> "Sensor":
         """The depth beside a camera's images of a board; raises DataError."""
-        own, target, lens = session.declaration.depth, session.boards.get(board), pair.camera
+        declared, target, lens = session.declaration.depth, session.boards.get(board), pair.camera
         # Measured poses of the target need neither.
         if lens is None or target is None or np.ptp(corner_positions(target)[:, 2]) > 0.0:
             raise DataError("it needs a camera and a flat board.")
-        table = session.cameras[camera] if own is None else own
+        table = session.cameras[camera] if declared is None else declared
         corners = corner_positions(target) if pair.board is None else pair.board.corners(target)
         seen, shape = (pair, lens, session), (corners, shape_basis(target))
         sensor = cls(*seen, *shape, table.depth_unit_m, table.depth_of == "ray")
-        if own is None or own.stated is None:
+        if declared is None or declared.stated is None:
             return sensor
         prior = session.declaration.prior["cam_from_depth"]
         pose = np.eye(4) if prior.pose is None else prior.pose
         sigmas = (prior.sigma_rad or 0.0, prior.sigma_m or 0.0)
         return replace(
-            sensor, by=DepthCamera(**vars(own.stated), cam_from_depth=pose, sigmas=sigmas)
+            sensor, by=DepthCamera(**vars(declared.stated), cam_from_depth=pose, sigmas=sigmas)
         )
 
     @property
@@ -135,8 +135,8 @@ class Sensor:
         if seen is None or seen.corners is None or seen.cam_from_target is None:
             raise DataError("the board was not found in the image.")
         depth = read_depth(images.read(view.depth), view.depth, size, self.unit_m)
-        beside = np.eye(4) if self.by is None else self.by.cam_from_depth
-        pose = invert(beside) @ seen.cam_from_target
+        cam_from_depth = np.eye(4) if self.by is None else self.by.cam_from_depth
+        pose = invert(cam_from_depth) @ seen.cam_from_target
         corners = project(self.lens, apply(pose, self.corners_m))
         if not np.isfinite(corners).all():
             raise DataError("the board is not in front of the camera.")
@@ -149,7 +149,7 @@ class Sensor:
         rays = self.rays(px)
         true = distances(pose, rays)[0]
         excess = depth[rows, columns] - true * self.lengths(rays)
-        shades = self._shades(view, apply(beside, true[:, None] * rays))
+        shades = self._shades(view, apply(cam_from_depth, true[:, None] * rays))
         side = max(float(np.ptp(corners, axis=0).max()) / _CELLS, 6.0)
         key = px // side @ [1e4, 1.0]
         order, found = np.argsort(key, kind="stable"), []

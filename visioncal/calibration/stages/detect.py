@@ -109,8 +109,10 @@ def detect(
     resolution = _resolution(session, among, found)
     sized = {view.number: _of_size(view, found[view.number], resolution) for view in views}
     for name in session.boards:
-        mine = [view for view in views if session.board_of(view) == name]
-        _check_layout(session.boards[name], {view.number: sized[view.number] for view in mine})
+        board_views = [view for view in views if session.board_of(view) == name]
+        _check_layout(
+            session.boards[name], {view.number: sized[view.number] for view in board_views}
+        )
     detected = {view: searched.found for view, searched in sized.items()}
     detected |= usable_corners(session, given, resolution)
     results = [detected[view.number] for view in among if view.number in detected]

@@ -50,14 +50,14 @@ def scaling(first: str, factor: float, board: str = "") -> Remedy:
     return replace(do, words=words)
 
 
-def other_size(share: float, variance: float, beside: str = "") -> Finding:
+def other_size(share: float, variance: float, further: str = "") -> Finding:
     """The finding on a board that is larger by a share of some variance, with words beside it."""
     short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
     return Finding(
         "board_size",
         f"By the robot's motion the board is {percent} {size} than the size by which a program "
-        f"measured its poses: all distances in them (cft_) are too {short}.{beside}",
+        f"measured its poses: all distances in them (cft_) are too {short}.{further}",
         scaling("Measure the board with a caliper. If the robot is right, ", 1.0 + share),
         mahalanobis_sq=share**2 / max(variance, np.finfo(float).tiny),
     )

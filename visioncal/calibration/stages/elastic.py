@@ -142,10 +142,10 @@ def slopes_of(arm: ArmData) -> dict[int, TwoSlopes]:
     if not knees:
         return {}
     found, (step, covariance) = dict[int, TwoSlopes](), tested.solved(knees, moves=True)
-    own = arm.columns[model.columns_of(COMPLIANCE)]
+    columns = arm.columns[model.columns_of(COMPLIANCE)]
     for at, (joint, knee) in enumerate(knees.items()):
         by = np.zeros((2, len(step)))
-        by[:, own[joint]] = model.weights[COMPLIANCE] / model.torque_nm
+        by[:, columns[joint]] = model.weights[COMPLIANCE] / model.torque_nm
         by[1, len(step) - 2 * len(knees) + 2 * at] = 1.0
         slopes = (model.compliance[joint] + by @ step).tolist()
         found[joint] = TwoSlopes(knee, *slopes, *np.sqrt(np.diag(by @ covariance @ by.T)).tolist())
@@ -155,10 +155,11 @@ def slopes_of(arm: ArmData) -> dict[int, TwoSlopes]:
 def _payload_factor(arm: ArmData) -> Factor | None:
     """Ratio of the actual to the predicted bending under the stated payload and force.
 
-    It is bilinear in factor and compliances, which a wrong load falsifies: beside all unknowns,
-    each joint has its bend by the load alone, linear as its compliance is; both are then fitted by
-    compliances and one factor, with their joint covariance (Gauss-Newton). None where there were
-    no loads, they bend nothing, or the arm's own weight does not tell load from compliance.
+    The bending is bilinear in factor and compliances, which a wrong load falsifies: beside all
+    unknowns, each joint has its bend by the load alone, linear as its compliance is; both are then
+    fitted by compliances and one factor, with their joint covariance (Gauss-Newton). None where
+    there were no loads, or these bend nothing, or the arm's own weight does not separate load from
+    compliance.
     """
     model, loads, reported = arm.model, arm.loads, arm.fit.problem.poses[arm.robot]
     if not loads.any or not model.compliance.any():
@@ -170,11 +171,11 @@ def _payload_factor(arm: ArmData) -> Factor | None:
     flanges, prior = {arm.robot: flange_jacobian}, PriorInformation(np.eye(count), np.zeros(count))
     widened = arm.fit.with_columns(Effect.free("payload", prior, flange_jacobian=flanges))
     covariance, (_, gradient) = widened.absorbed, widened.equations
-    own = np.append(arm.columns[model.columns_of(COMPLIANCE)], np.arange(-count, 0))
+    columns = np.append(arm.columns[model.columns_of(COMPLIANCE)], np.arange(-count, 0))
     units = np.repeat([model.weights[COMPLIANCE] / model.torque_nm / _SOFT, 1.0], count)
-    found = -units * (covariance @ gradient)[own]
+    found = -units * (covariance @ gradient)[columns]
     found[:count] += model.compliance / _SOFT
-    information = np.linalg.inv(np.outer(units, units) * covariance[np.ix_(own, own)])
+    information = np.linalg.inv(np.outer(units, units) * covariance[np.ix_(columns, columns)])
     compliance, by_load = np.split(found, 2)
     values = np.append(compliance, compliance @ by_load / (compliance @ compliance))
     for _ in range(_ROUNDS):

@@ -119,8 +119,8 @@ class ErrorSizes:
 
     def steadied_by(self, kind: str, camera: str) -> FloatArray:
         """(c,) values of a kind of a problem's effects that `steadied` takes; (1,) zero of none."""
-        own = (one for one in self.grown if one.effect.frame == camera)
-        values = (one.values for one in own if one.effect.kind == kind.replace("_", " "))
+        camera_effects = (one for one in self.grown if one.effect.frame == camera)
+        values = (one.values for one in camera_effects if one.effect.kind == kind.replace("_", " "))
         return next(values, np.zeros(1))
 
     def instead_of(self, kind: str) -> str:
@@ -161,8 +161,10 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         # In each view, the lens is another than on average.
         name = found.effect.frame
         focal_px = fit.unknowns.lenses[name].matrix[0]
-        own = float(np.std(found.columns[:, 0] @ found.values)) / focal_px / _noise_px(fit, name)
-        jitter = float(np.hypot(levels[name].jitter, own))
+        focal_jitter = (
+            float(np.std(found.columns[:, 0] @ found.values)) / focal_px / _noise_px(fit, name)
+        )
+        jitter = float(np.hypot(levels[name].jitter, focal_jitter))
         levels[name] = replace(levels[name], jitter=jitter)
     zoomed, grew = dict[str, Zoom](), {at.effect.frame: abs(float(at.values[0])) for at in grown}
     for effect, zoom, rms in _changed(fit):
@@ -302,8 +304,8 @@ def _size(fit: Fit, name: str) -> float:
 
 def _noise_px(fit: Fit, camera: str) -> float:
     """Noise of a corner's coordinate, as estimated or as stated [px]."""
-    own = (one.corners for one in fit.cell.sightings if one.seer == camera)
-    stated = [at.stated_px for at in own if at is not None and at.stated_px is not None]
+    corner_sets = (one.corners for one in fit.cell.sightings if one.seer == camera)
+    stated = [at.stated_px for at in corner_sets if at is not None and at.stated_px is not None]
     return fit.sizes.get(f"px {camera}") or float(np.median(stated))
 
 

@@ -86,15 +86,15 @@ def other_names(
     seen, found = problem.observations, dict[int, tuple[str, str]]()
     frames = {*problem.tree.branches, problem.tree.root}
     for at in out.tolist():
-        own = tuple(pair[at].partition("@")[0] for pair in (seen.observers, seen.observed))
+        given = tuple(pair[at].partition("@")[0] for pair in (seen.observers, seen.observed))
         likes = [
             sorted(name for name in frames if name.partition("_")[0] == frame.partition("_")[0])
-            for frame in own
+            for frame in given
         ]
         pairs = [
-            own,
-            *((name, own[1]) for name in likes[0]),
-            *((own[0], name) for name in likes[1]),
+            given,
+            *((name, given[1]) for name in likes[0]),
+            *((given[0], name) for name in likes[1]),
         ]
         pairs = [*dict.fromkeys(pairs)]
         repeated = np.full(len(pairs), at)
@@ -136,8 +136,8 @@ def exchanged(
         if left.issuperset(pair):
             circles.append(tuple(pair))
             left.difference_update(pair)
-    own = {(frames[at], stops[at]): at for at in sorted(left)}
-    following = {at: own.get((frames[at], fitting[at][0])) for at in left}
+    index_of = {(frames[at], stops[at]): at for at in sorted(left)}
+    following = {at: index_of.get((frames[at], fitting[at][0])) for at in left}
     for first in sorted(left):
         circle = [first]
         while (after := following[circle[-1]]) is not None and after not in circle:

@@ -69,8 +69,8 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
     if counts := {len(joint) for joint in joints.values()} - {robot.joint_count}:
         words = f"there are {min(counts)} joint angles a row, and {robot.name} has "
         wanted = [f"q{at + 1}_rad" for at in range(min(counts), robot.joint_count)]
-        beside = of_other_units(wanted, rows[0].text) if rows else ""
-        words = f"{words}{robot.joint_count} joints{beside}."
+        unit_note = of_other_units(wanted, rows[0].text) if rows else ""
+        words = f"{words}{robot.joint_count} joints{unit_note}."
         step = "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
         if not by_view:
             raise DataError(f"views.csv: {words}", next_step=step)
@@ -144,14 +144,14 @@ def _base_and_flange(model: FloatArray, poses: FloatArray, guess: JointGuess | N
     """
     flange_from_base = invert(poses)
     lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE[0])
-    # The most central one, robust to wrong rows; those of one stop give the same.
+    # The most central tool is robust to wrong rows; poses of one stop give the same.
     tools = np.unique(invert(invert(model) @ poses), axis=0)
     fits = [distances(flange_from_base, model, lever, (np.eye(4), tool)) for tool in tools]
-    own = min(fits, key=lambda fit: float(np.median(fit.residuals)))
-    if guess is None or np.all(_typical(own) <= _AGREE):
-        return own
-    ratios = _typical(own) / np.maximum(_typical(guess.best.fit), np.finfo(float).tiny)
-    return guess.best.fit if ratios.max() > CLEAR_RATIO and ratios.min() >= 1.0 else own
+    same_base = min(fits, key=lambda fit: float(np.median(fit.residuals)))
+    if guess is None or np.all(_typical(same_base) <= _AGREE):
+        return same_base
+    ratios = _typical(same_base) / np.maximum(_typical(guess.best.fit), np.finfo(float).tiny)
+    return guess.best.fit if ratios.max() > CLEAR_RATIO and ratios.min() >= 1.0 else same_base
 
 
 def _with_base(matched: MatchedJoints, base: FloatArray) -> MatchedJoints:

@@ -105,7 +105,7 @@ class SelectedArmLevel:
 
     nominal: LevelFit  # The fit of the nominal arm.
     fit: LevelFit  # The fit with the errors; the nominal one where none explain more than chance.
-    asked: str  # The level that was asked for.
+    requested: str  # The level that was requested.
     views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
 
     @property
@@ -144,7 +144,7 @@ def select_errors(
     robot: str,
     bases: Mapping[str, FloatArray],
     torque_nm: float,
-    asked: str,
+    level: str,
     noise: Noise,
     harmonics: FloatArray | None,
 ) -> SelectedArmLevel | None:
@@ -159,7 +159,7 @@ def select_errors(
         robot: The robot.
         bases: (s, 6, p) Jacobian of the flange pose by stop, for the errors of each block.
         torque_nm: The torque of a unit compliance [N m].
-        asked: A key of `ASKED`.
+        level: A key of `ASKED`.
         noise: The noise's levels to start from.
         harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
 
@@ -169,11 +169,13 @@ def select_errors(
     is_enough = len(stops_of(problem, robot)) >= FEWEST_STOPS
 
     def likely(blocks: Sequence[str]) -> ArmSizes | None:
-        own = {name: basis for name, basis in bases.items() if name in blocks}
+        block_bases = {name: basis for name, basis in bases.items() if name in blocks}
         waves = harmonics if HARMONICS in blocks else None
         with suppress(np.linalg.LinAlgError):
             if is_enough:
-                return estimate_arm_sizes(problem, state, noise, robot, own, torque_nm, waves)
+                return estimate_arm_sizes(
+                    problem, state, noise, robot, block_bases, torque_nm, waves
+                )
         return None
 
     def fitted(sizes: ArmSizes | None) -> LevelFit:
@@ -185,26 +187,26 @@ def select_errors(
 
     # Numbers may be so large that their squares are none.
     with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
-        sizes = likely(ASKED[asked])
+        sizes = likely(ASKED[level])
         if harmonics is not None and sizes is None:
             return None
         nominal = LevelFit.of(problem, state, robot, noise, None)
         fit = fitted(sizes)
-    return SelectedArmLevel(nominal, fit, asked)
+    return SelectedArmLevel(nominal, fit, level)
 
 
-def check_level(asked: str) -> None:
+def check_level(level: str) -> None:
     """Refuses an unknown level.
 
     Raises:
-        DataError: It is not known.
+        DataError: The level is not known.
     """
     levels = (*ASKED, "hand-eye")
-    if asked not in levels:
-        raise DataError(f"level {asked!r} is not one of {', '.join(levels)}.", culprits=["level"])
+    if level not in levels:
+        raise DataError(f"level {level!r} is not one of {', '.join(levels)}.", culprits=["level"])
 
 
-def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None:
+def check_level_is_possible(level: str, *, can: bool, misread: str = "") -> None:
     """Refuses a level that the session cannot give.
 
     `can` is whether there are joint angles that belong to the robot's model and poses, `misread`
@@ -213,9 +215,9 @@ def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None
     Raises:
         DataError: There are no joint angles that belong to a known model.
     """
-    if asked in ("offsets", "kinematics", "elastic") and not can:
+    if level in ("offsets", "kinematics", "elastic") and not can:
         raise DataError(
-            f"level {asked!r} needs the joint angles of every view and a model of the robot that "
+            f"level {level!r} needs the joint angles of every view and a model of the robot that "
             "they belong to.",
             culprits=["level"],
             next_step=misread or "Record q1_rad ..., and name [robot] model in session.toml.",
@@ -224,12 +226,15 @@ def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None
 
 def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
     """States the chosen level, for the verdict."""
-    if kinematics.level == NOMINAL and kinematics.asked not in ("auto", "thermal"):
+    if kinematics.level == NOMINAL and kinematics.requested not in ("auto", "thermal"):
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
         )
-    elif kinematics.asked == "elastic" and not {COMPLIANCE, WEIGHT} & kinematics.fit.errors.keys():
+    elif (
+        kinematics.requested == "elastic"
+        and not {COMPLIANCE, WEIGHT} & kinematics.fit.errors.keys()
+    ):
         yield (
             "No joint was found to bend under load, as asked: what else the arm errs by explains "
             "the views as well. State payload_kg in views.csv, and record stops with and "

@@ -50,14 +50,14 @@ def steps_of(
     sized = with_free_sizes(fit)
     if not found or sized is fit:
         return found
-    beside = dict[str, ArmErrors]()
+    arm_errors = dict[str, ArmErrors]()
     for robot, one in errors.items():
-        own = find_pose_errors(sized.problem, sized.state, sized.noise, robot)
-        beside[robot] = one if own is None else own
+        sized_errors = find_pose_errors(sized.problem, sized.state, sized.noise, robot)
+        arm_errors[robot] = one if sized_errors is None else sized_errors
     size = fit.problem.size
     return tuple(
         replace(step, spread=step.spread[:size, :size])
-        for step in likely_steps(sized.problem, sized.solution, beside, offsets)
+        for step in likely_steps(sized.problem, sized.solution, arm_errors, offsets)
     )
 
 
@@ -71,8 +71,8 @@ def with_free_sizes(fit: Fit) -> Fit:
     if len(held):
         effects = list[Effect]()
         for effect in fit.problem.effects:
-            own = fit.problem.effect_columns[effect.name]
-            freed = np.isin(np.arange(own.start, own.stop), held)
+            places = fit.problem.effect_columns[effect.name]
+            freed = np.isin(np.arange(places.start, places.stop), held)
             effects.append(replace(effect, held=effect.held & ~freed))
         wide = replace(fit, problem=fit.problem.with_effects(effects))
     elif targets and not len(columns) and SIZE not in fit.problem.effect_columns:
@@ -116,20 +116,20 @@ def likely_steps(
         if step.kind == DRIFT:
             continue
         try:
-            gain, apart, there = evidence(problem, fit, step)
-            both = twice(problem, fit, step, (apart, there)) if step.kind == FRAME else None
+            gain, apart, solution = evidence(problem, fit, step)
+            double = twice(problem, fit, step, (apart, solution)) if step.kind == FRAME else None
         except (VisioncalError, np.linalg.LinAlgError):
             # A step with which no fit converges is not likelier.
             continue
-        alone = _weighed(replace(step, gain=gain - penalty), apart, there, errors)
-        if both is not None and (drift is None or both[0].gain - 2.0 * penalty > drift.gain):
-            second = replace(both[0], gain=both[0].gain - 2.0 * penalty)
-            of_both = _weighed(second, *both[1:], errors)
-            if of_both.step.gain - alone.step.gain > _CLEARLY:
+        single = _weighed(replace(step, gain=gain - penalty), apart, solution, errors)
+        if double is not None and (drift is None or double[0].gain - 2.0 * penalty > drift.gain):
+            second = replace(double[0], gain=double[0].gain - 2.0 * penalty)
+            of_both = _weighed(second, *double[1:], errors)
+            if of_both.step.gain - single.step.gain > _CLEARLY:
                 likely.append(of_both)
                 continue
         if drift is None or step.gain - penalty >= drift.gain:
-            likely.append(alone)
+            likely.append(single)
     clear = sorted(
         (one.step for one in likely if one.step.gain > one.needed), key=lambda step: -step.gain
     )
@@ -149,16 +149,16 @@ class _Weighed:
 
 
 def _weighed(
-    step: Step, apart: Problem, there: Solution, errors: Mapping[str, ArmErrors]
+    step: Step, apart: Problem, solution: Solution, errors: Mapping[str, ArmErrors]
 ) -> _Weighed:
     """A step by the fit with it: one that errors of arms explain as well is none."""
     gain, needed = step.gain, _CLEARLY
     for robot, arm in errors.items():
-        beside = find_pose_errors(apart, there.state, there.noise, robot)
-        gain += (beside.gain if beside else 0.0) - arm.gain
+        remaining = find_pose_errors(apart, solution.state, solution.noise, robot)
+        gain += (remaining.gain if remaining else 0.0) - arm.gain
         # A frame's step takes six values, and errors that it leaves are others. Of a board's size,
         # or of a joint, they may be what seems to change.
-        left = beside if step.kind == FRAME else arm
+        left = remaining if step.kind == FRAME else arm
         if left is not None and left.is_significant:
             # The kind of an arm's errors is known less well than their presence.
             needed = 3.0 * _CLEARLY

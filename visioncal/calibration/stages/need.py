@@ -325,7 +325,7 @@ def _uncorrected(
     Args:
         picks: Picks at n sightings.
         fitted: Their fit.
-        stops: (n,) their stops.
+        stops: (n,) the sightings' stops.
         in_base: (n, 4, 4) `base_from_target`.
         at_m: (n, 3) the positions, in the targets' frames where `whole`, else in the base [m].
         whole: Whether the picks are in the targets' frames.
@@ -386,10 +386,10 @@ def _arm_covariances(
     """Covariances from arm errors that a fit treats as noise, for each of n sightings.
 
     Args:
-        closure: Their closure.
+        closure: The closure of the sightings.
         robot: The robot.
-        stops: (n,) their stops.
-        errors: Its arm's errors.
+        stops: (n,) the sightings' stops.
+        errors: The errors of the robot's arm.
         bias: (p, q) the fit's bias for each of them, scaled by its sigma.
 
     Returns:
@@ -397,9 +397,9 @@ def _arm_covariances(
         values than at the stops of the fit, and vary as much as among these.
     """
     by_fit, last = closure.linear.jacobian @ bias, errors.is_time_correlated
-    own = errors.sigma * (closure.by_flange(robot) @ errors.basis[stops])
-    by_posture = by_fit[:, :, ~last] - own[:, :, ~last]
-    changing = own[:, :, last] - own[:, :, last].mean(axis=0)
+    at_stops = errors.sigma * (closure.by_flange(robot) @ errors.basis[stops])
+    by_posture = by_fit[:, :, ~last] - at_stops[:, :, ~last]
+    changing = at_stops[:, :, last] - at_stops[:, :, last].mean(axis=0)
     in_time = np.concatenate([by_fit[:, :, last], changing], axis=2)
     return by_posture @ by_posture.mT, in_time @ in_time.mT
 

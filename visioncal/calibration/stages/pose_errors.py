@@ -48,14 +48,14 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         # Noise of the flange from stop to stop, which acts on distant frames with its lever.
         flange = np.tile(np.diag(sigmas), (len(posed), 1, 1))
         kinds.append(Process(1 / 4, np.eye(len(posed)), flange))
-    alone, by_flange = _stop_errors(problem, state, noise, robot)
-    at = np.searchsorted(posed, alone.stops)
+    by_stop, by_flange = _stop_errors(problem, state, noise, robot)
+    at = np.searchsorted(posed, by_stop.stops)
     seen = {
         replace(kind, kernel=kind.kernel[np.ix_(at, at)], basis=by_flange @ kind.basis[at]): kind
         for kind in kinds
     }
     try:
-        models, logs_of = zip(*weigh(alone, flanges[at], [*seen]), strict=True)
+        models, logs_of = zip(*weigh(by_stop, flanges[at], [*seen]), strict=True)
     except np.linalg.LinAlgError:
         return None
     logs = np.array(logs_of)
@@ -103,7 +103,7 @@ def _stop_errors(
     levels = noise.robots.copy()
     levels[index] = 0.0
     others = problem.error_covariance(replace(noise, robots=levels))
-    total, own = problem.error_covariance(noise), np.flatnonzero(with_robot)
+    total, robot_units = problem.error_covariance(noise), np.flatnonzero(with_robot)
     rows = np.concatenate([units.jacobian, units.residuals[:, :, None]], axis=2)
     p = rows.shape[2] - 1
     rest = gram(
@@ -112,15 +112,15 @@ def _stop_errors(
     rest[:p, :p] += common.information
     rest[:p, p] += common.gradient
     rest[p, :p] += common.gradient
-    alone = StopErrors(
-        likelihood.stops[own],
-        (units.known + others)[own],
-        (total - others)[own],
-        rows[own],
+    by_stop = StopErrors(
+        likelihood.stops[robot_units],
+        (units.known + others)[robot_units],
+        (total - others)[robot_units],
+        rows[robot_units],
         rest,
         p,
     )
-    return alone, likelihood.moved(index, np.broadcast_to(np.eye(6), (count, 6, 6)))
+    return by_stop, likelihood.moved(index, np.broadcast_to(np.eye(6), (count, 6, 6)))
 
 
 def _columns(
@@ -133,8 +133,8 @@ def _columns(
     all_stops, columns = np.arange(count), np.zeros((count, 6, 0))
     remainder = np.zeros((count, 6, 6))
     for kind, square in weighed:
-        own = np.einsum("sar,sbr->sab", kind.basis, kind.basis, optimize=True)
-        remainder += square * np.diag(kind.kernel)[:, None, None] * own
+        products = np.einsum("sar,sbr->sab", kind.basis, kind.basis, optimize=True)
+        remainder += square * np.diag(kind.kernel)[:, None, None] * products
     total = np.diagonal(remainder[observed].mean(axis=0)).reshape(2, 3).mean(axis=1)
     scale = np.repeat(np.sqrt(np.maximum(total, LEAST_SIGMA**2)), 3)
     for _ in range(min(len(observed), most) if weighed else 0):

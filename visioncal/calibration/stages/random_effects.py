@@ -83,11 +83,11 @@ def _of_lens(
     for name, compressed in zip(optics.problems, corners.compressed, strict=True):
         views = optics.rows(name)
         if name == found.effect.frame:
-            own = (rows >= views.start) & (rows < views.stop)
-            lens = found.columns[problem.observations.stops[own]]
-            by_lens = compressed.by_shared[rows[own] - views.start, :, : lens.shape[1]]
-            moved[own] = by_lens @ lens
-    # Of what the corners were not steadied by.
+            is_of_lens = (rows >= views.start) & (rows < views.stop)
+            lens = found.columns[problem.observations.stops[is_of_lens]]
+            by_lens = compressed.by_shared[rows[is_of_lens] - views.start, :, : lens.shape[1]]
+            moved[is_of_lens] = by_lens @ lens
+    # The corners were corrected by the estimated growth: its covariance is that of the rest.
     information = np.asarray(np.linalg.inv(found.covariance), dtype=float)
     prior = PriorInformation(information, np.zeros(len(found.values)))
     kind = found.effect.kind.replace(" ", "_")

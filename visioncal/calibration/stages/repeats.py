@@ -102,9 +102,9 @@ def with_stop_means(seen: T) -> T:
             for (seer, *_), views in groups.items()
             if seer == frame
         ]
-        for own in shown if sum(map(bool, shown)) >= FEWEST_VIEWS else ():
-            if len(own) >= _MANY:
-                mean, others = _mean_of(own)
+        for stop_corners in shown if sum(map(bool, shown)) >= FEWEST_VIEWS else ():
+            if len(stop_corners) >= _MANY:
+                mean, others = _mean_of(stop_corners)
                 corners[mean.view] = mean
                 joined |= dict.fromkeys(others, mean.view)
         left = {view: found for view, found in corners.items() if view not in joined}
@@ -202,8 +202,8 @@ def _entries(pose: FloatArray | None) -> FloatArray:
 
 def _others(row: View) -> frozenset[tuple[str, float]]:
     """Other measurements of a row: loads, temperatures, torques."""
-    own = _others_among(tuple(row.numbers))
-    return frozenset((name, row.numbers[name]) for name in own)
+    names = _others_among(tuple(row.numbers))
+    return frozenset((name, row.numbers[name]) for name in names)
 
 
 @cache

@@ -220,8 +220,8 @@ def _contradicted_joints(
         reported_pose = reported.base_from_flange[view]
         pose = reported_pose @ invert(matched.flange_from_reported)
         fit, flange_from_base = guess.best.fit, np.tile(invert(seen[view]), (2, 1, 1))
-        both = distances(flange_from_base, np.array([model, pose]), fit.lever, (fit.x, fit.z))
-        by_joints, by_pose = both.residuals
+        compared = distances(flange_from_base, np.array([model, pose]), fit.lever, (fit.x, fit.z))
+        by_joints, by_pose = compared.residuals
         if by_pose < by_joints:
             yield Rejection(view, f"{reason}, with which the camera agrees")
 

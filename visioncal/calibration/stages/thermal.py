@@ -222,10 +222,12 @@ def find_drift(
         nominal: Its model.
     """
     poses = problem.poses[robot]
-    mine = np.isin(np.arange(len(poses)), problem.observations.stops[rows_of(problem, robot)])
-    model = ArmModel.of(nominal, stops.q, poses[mine])
+    robot_stops = np.isin(
+        np.arange(len(poses)), problem.observations.stops[rows_of(problem, robot)]
+    )
+    model = ArmModel.of(nominal, stops.q, poses[robot_stops])
     basis = np.zeros((len(poses), 6, model.size_of("links")))
-    basis[mine] = model.columns("links", stops.q)
+    basis[robot_stops] = model.columns("links", stops.q)
     with one_blas_thread():
         likelihood = robot_likelihood(problem, start, starting_noise(problem))
         links = find_arm_errors(likelihood, problem.robots.index(robot), basis)
@@ -236,7 +238,7 @@ def find_drift(
         drift = ThermalFit.expected(model.robot, nominal, inputs)
         size = len(drift.values)
         for _ in range(20):
-            warm = drift.applied_to(problem, robot, stops, mine)
+            warm = drift.applied_to(problem, robot, stops, robot_stops)
             values = np.append(fit.state.values[: len(cold.state.values)], drift.values)
             fit = fit_problem(warm, State(fit.state.edges, values), fit.noise)
             step = fit.state.values[-size:] - drift.values
@@ -244,7 +246,7 @@ def find_drift(
             drift = drift.moved(step * min(1.0, 1.0 / max(largest, _SETTLED)))
             if largest < _SETTLED:
                 break
-        warm = drift.applied_to(problem, robot, stops, mine)
+        warm = drift.applied_to(problem, robot, stops, robot_stops)
         state = State(fit.state.edges, np.append(fit.state.values[:-size], drift.values))
         costs = [
             robot_likelihood(part, at, fit.noise).white[1]
