@@ -330,7 +330,7 @@ def _write_easy_handeye(version: int, content: Content) -> str:
 def _ros_notes(content: Content) -> list[str]:
     """Says in lines for a comment what the transform is, its quality, and what its frames are."""
     names = zip((content.parent, content.child), content.frames, strict=True)
-    meanings = [f"{name}: {_MEANINGS[own]}" for name, own in names if own in _MEANINGS]
+    meanings = [f"{name}: {_MEANINGS[frame]}" for name, frame in names if frame in _MEANINGS]
     return [*content.notes, *meanings]
 
 

@@ -33,12 +33,12 @@ def several_recordings(source: Source, requested: ImportOptions) -> DataError | 
             # An instrument's poses or points beside joint angles.
             is_of_joints = not source.images and bool(joint_names(fields, ()))
             is_of_joints &= bool(poses or columns_named(fields, ("x", "y", "z")))
-            both = len(poses) > 1 or is_of_joints
-            if is_whole(fields) if part.kin else both:
-                own = alike.setdefault(
+            has_two_sides = len(poses) > 1 or is_of_joints
+            if is_whole(fields) if part.kin else has_two_sides:
+                same_fields = alike.setdefault(
                     (part.kin,) if part.kin else tuple(sorted(fields.numbers)), []
                 )
-                own.append((part.group.files[0], len(fields)))
+                same_fields.append((part.group.files[0], len(fields)))
     found = max(alike.values(), key=len, default=[])
     if len(found) < 2:
         return None
@@ -78,14 +78,14 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
     if sides[robot] == ["robot"] and sides[camera] == ["camera"]:
         return robot, camera
     command = [str(robot) if word == str(source.path) else word for word in requested.command]
-    both = shlex.join([*command, "--camera-file", str(camera)])
+    two_files = shlex.join([*command, "--camera-file", str(camera)])
     if _is_run_again(fields, others):
         # Of the very same rows both sides would be one.
         is_copy = all(
             name in others.numbers and np.array_equal(numbers, others.numbers[name], equal_nan=True)
             for name, numbers in fields.numbers.items()
         )
-        again = "." if is_copy else f"; or both, where their frames are alike:\n{both}"
+        again = "." if is_copy else f"; or both, where their frames are alike:\n{two_files}"
         raise DataError(
             f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}, "
             "as of two runs of one side: then nothing says what a camera saw.",
@@ -96,7 +96,8 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
         "which are the robot's is not stated.",
         culprits=[str(robot), str(camera)],
-        next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n{both}",
+        next_step="Name the file of the robot, and that of the camera with "
+        f"--camera-file:\n{two_files}",
     )
 
 

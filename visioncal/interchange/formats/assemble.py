@@ -326,8 +326,8 @@ def _image_paths(images: Sequence[Path | None], name: str, notes: list[str]) -> 
         if file is None or file in paths:
             continue
         # Archives of other systems leave names in their own encoding.
-        own = os.fsencode(file.name).decode("utf-8" if file.name.isprintable() else "latin-1")
-        names = chain([own], (f"{number}_{own}" for number in count(at)))
+        file_name = os.fsencode(file.name).decode("utf-8" if file.name.isprintable() else "latin-1")
+        names = chain([file_name], (f"{number}_{file_name}" for number in count(at)))
         # Some file systems do not distinguish upper and lower case.
         paths[file] = next(name for name in names if name.casefold() not in taken)
         taken.add(paths[file].casefold())
@@ -425,11 +425,11 @@ def _of_size(
 
     Images of another shape are part of others: those keep the lens as it is, and are refused later.
     """
-    there = [path for path in paths if store.exists(path)] if "matrix" in lens else []
+    existing = [path for path in paths if store.exists(path)] if "matrix" in lens else []
     sizes = set[tuple[int, int] | None]()
     # Pictures that cannot be read are refused later, with what else is wrong.
     with suppress(DataError):
-        sizes = {image_size(store.read(path)) for path in there[:_SIZED]} - {None}
+        sizes = {image_size(store.read(path)) for path in existing[:_SIZED]} - {None}
     stated = tuple(lens.get("resolution", ()))
     if len(sizes) != 1 or stated in sizes or not stated:
         return lens

@@ -72,8 +72,8 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             path = f"images/{camera}{'_' if camera else ''}{at:06d}.{images.ending}"
             places[path] = topic, images.received_ns[at]
             rows.append((camera, images.stamps_s[at], path))
-        own = [row[1:] for row in rows[len(rows) - len(chosen) :]]
-        depths |= _depths(contents, topic, own, notes)
+        topic_rows = [row[1:] for row in rows[len(rows) - len(chosen) :]]
+        depths |= _depths(contents, topic, topic_rows, notes)
     rows.sort(key=lambda row: row[1])
     columns = {} if len(cameras) == 1 else {"camera": tuple(camera for camera, _, _ in rows)}
     if depths:
@@ -111,10 +111,10 @@ def _cameras(contents: BagContents, requested: ImportOptions) -> dict[str, str]:
     """The topics of images to take, and the cameras' names; the only one has none."""
     topics = list(contents.images)
     if requested.image is not None:
-        asked = [name.strip() for name in requested.image.split(",")]
-        for name in asked:
+        named = [name.strip() for name in requested.image.split(",")]
+        for name in named:
             _check_named(name, topics, "--image-key")
-        topics = asked
+        topics = named
     # Of one camera, raw images come before compressed ones, and unrectified before rectified ones.
     topics.sort(key=lambda name: ("compressed" in name, "rect" in name))
     first = {_namespace(topic): topic for topic in reversed(topics)}
@@ -151,8 +151,10 @@ def _depths(
     for stamp_s, path in rows:
         nearest = int(np.argmin(np.abs(stamps_s - stamp_s)))
         if abs(stamps_s[nearest] - stamp_s) <= limit_s:
-            own = str(Path(path.replace("images/", "depth/", 1)).with_suffix(f".{depth.ending}"))
-            found[path] = own, (name, depth.received_ns[nearest])
+            depth_path = str(
+                Path(path.replace("images/", "depth/", 1)).with_suffix(f".{depth.ending}")
+            )
+            found[path] = depth_path, (name, depth.received_ns[nearest])
     notes.append(f"{topic}: {len(found)} of {len(rows)} images have depth by {name}.")
     return found
 

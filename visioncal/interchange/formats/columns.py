@@ -85,14 +85,14 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     faults: list[DataError] = []
     readings = _proposed(source, requested)
     instead = image_groups(requested.images) if requested.images else None
-    for rank, fields, asked in readings:
+    for rank, fields, options in readings:
         try:
-            for more, foreign in _recordings(fields, asked, images, instead):
+            for more, foreign in _recordings(fields, options, images, instead):
                 target, of_board = board if foreign.images else (None, ())
-                beside = [each for _, each, _ in readings if each is not fields]
-                all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(asked, requested))
-                all_notes += (*armless_note(foreign, asked),)
-                all_notes += series_note(fields, beside)
+                other_fields = [each for _, each, _ in readings if each is not fields]
+                all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(options, requested))
+                all_notes += (*armless_note(foreign, options),)
+                all_notes += series_note(fields, other_fields)
                 lens_of = foreign.lens or lens
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
                 found.append((rank + more, whole))
@@ -121,12 +121,12 @@ def _proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Field
         raise
 
 
-def _arm_note(asked: ImportOptions, requested: ImportOptions) -> Iterator[str]:
+def _arm_note(options: ImportOptions, requested: ImportOptions) -> Iterator[str]:
     """A note on the robot whose description stands beside the rows, where the user names none."""
-    if asked.robot_model and not requested.robot_model:
+    if options.robot_model and not requested.robot_model:
         yield (
-            f"{', '.join(asked.joints)} are the joints of {Path(asked.robot_model).name}, to its "
-            f"{asked.tip}; --robot-model and --tip name another."
+            f"{', '.join(options.joints)} are the joints of {Path(options.robot_model).name}, to "
+            f"its {options.tip}; --robot-model and --tip name another."
         )
 
 
@@ -147,8 +147,8 @@ def _files_apart(
     check_points(source)
     if apart := tables_apart(source, requested):
         return apart
-    own = pose_names(fields, requested.robot.names, "robot", ())
-    others = possible_poses(fields, own) if first.robot.present.any() else ()
+    robot_names = pose_names(fields, requested.robot.names, "robot", ())
+    others = possible_poses(fields, robot_names) if first.robot.present.any() else ()
     if any(item.is_of_target for item in others):
         raise unknown(source, requested, [fields])
     return None
@@ -197,8 +197,8 @@ def _recordings(
     notes += fields.notes
     for whose, of_side in names.items():
         if of_side:
-            asked = requested.robot if whose == "robot" else requested.camera
-            poses[whose], more, unstated[whose] = poses_from(fields, of_side, asked, whose)
+            side_options = requested.robot if whose == "robot" else requested.camera
+            poses[whose], more, unstated[whose] = poses_from(fields, of_side, side_options, whose)
             notes += more
     if irregular := [name for name in fields.shape_errors if name not in used]:
         notes.append(f"Left aside, as rows differ in their shape: {some_of(irregular)}.")
@@ -265,8 +265,8 @@ def _pose_fields(fields: Fields, requested: ImportOptions) -> dict[Side, tuple[s
     ]
     names: dict[Side, tuple[str, ...]] = {"robot": (), "camera": ()}
     # Columns that the user names of one side are not the other's.
-    for whose, asked in sorted(sides, key=lambda side: not side[1].names):
-        names[whose] = pose_names(fields, asked.names, whose, used)
+    for whose, side_options in sorted(sides, key=lambda side: not side[1].names):
+        names[whose] = pose_names(fields, side_options.names, whose, used)
         used.update(names[whose])
     return names
 
@@ -345,25 +345,25 @@ def _images(
     fields: Fields,
     requested: ImportOptions,
     found: Sequence[FileGroup],
-    asked: Sequence[FileGroup] | None,
+    given: Sequence[FileGroup] | None,
     taken: Collection[str],
     has_camera_poses: bool,
 ) -> tuple[Pairing, str]:
     """Pairs the rows with images, and names the field that names them."""
     column = requested.image
-    every = found if asked is None else asked
+    every = found if given is None else given
     groups = [group for group in every if group.is_images]
     name = fields.find(column) if column else _image_name(fields, groups, taken)
     if name in fields.texts:
         cells = _with_folders(fields, name, groups)
-        named = None if asked is None else groups
+        named = None if given is None else groups
         pairing = Pairing(images_named(cells, fields.folder, groups, named))
         return with_depth(pairing, every), name
     try:
         return with_depth(paired(fields, groups), every) if groups else Pairing(()), ""
     except UnpairedError as error:
         # Pictures of a page are no views', where poses of the target say what these saw.
-        if asked is not None or requested.target or not has_camera_poses:
+        if given is not None or requested.target or not has_camera_poses:
             raise
         return Pairing((), (f"The images are left aside: {error.message}",)), ""
 

@@ -142,11 +142,11 @@ def _with_extrinsics(document: object) -> object:
         return document
     called = {str(key).lower(): key for key in document}
     key = called.get("extrinsic_parameters")
-    both = np.array([]) if key is None else np.asarray(document[key])
-    if both.ndim != 2 or both.shape[1] != 6:
+    extrinsics = np.array([]) if key is None else np.asarray(document[key])
+    if extrinsics.ndim != 2 or extrinsics.shape[1] != 6:
         return document
     rest = {name: value for name, value in document.items() if name != key}
-    turns, places = np.split(both, 2, axis=1)
+    turns, places = np.split(extrinsics, 2, axis=1)
     found = {"board_to_camera_rvecs": [*turns], "board_to_camera_tvecs": [*places]}
     return {**rest, **{f"{key}.{name}": rows for name, rows in found.items()}}
 

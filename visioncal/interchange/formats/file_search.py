@@ -226,14 +226,14 @@ def _walked(folder: Path, depth: int) -> Iterator[Path]:
 def files_in(folder: Path) -> tuple[Path, ...]:
     """Files of a folder in natural order; empty where it cannot be listed.
 
-    Links that lead out of it are left out.
+    Links that lead out of the folder are left out.
     """
     try:
         files = [path for path in folder.iterdir() if path.is_file()]
     except OSError:
         return ()
-    own = (file for file in files if not file.is_symlink() or is_inside(file, folder))
-    return tuple(sorted(own, key=natural))
+    inside = (file for file in files if not file.is_symlink() or is_inside(file, folder))
+    return tuple(sorted(inside, key=natural))
 
 
 def head(path: Path) -> str:

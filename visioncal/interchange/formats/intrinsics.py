@@ -181,14 +181,14 @@ def _around(content: Mapping[str, Any], outer: str, where: str) -> dict[str, Any
     """Content of a lens and beside it: of single numbers those alone that are sides around it."""
     inner = content[outer]
     _, _, *centre = _four(inner, where) or []
-    beside = {name: value for name, value in content.items() if name != outer}
+    siblings = {name: value for name, value in content.items() if name != outer}
     sides = {name for names in _SIZE_KEYS for name in names}
-    for plain, name in _plain(beside).items():
-        value = beside[name]
+    for plain, name in _plain(siblings).items():
+        value = siblings[name]
         is_side = plain in sides and number(value, f"{where}: {name}") > max(centre)
         if not (is_side or isinstance(value, Mapping | list | str | np.ndarray)):
-            del beside[name]
-    return {**beside, **inner}
+            del siblings[name]
+    return {**siblings, **inner}
 
 
 def intrinsics_from(

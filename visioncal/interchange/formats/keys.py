@@ -155,23 +155,23 @@ def _equal(keys: Sequence[object], their: Sequence[object]) -> tuple[IntArray, b
 
 def _nearest(first_s: Sequence[object], second_s: Sequence[object]) -> IntArray:
     """(n,) the other's row of the nearest time, but for a constant offset; -1 for none."""
-    mine_s, their_s = np.array(first_s, dtype=float), np.array(second_s, dtype=float)
-    best = np.full(len(mine_s), -1)
-    if len(mine_s) > len(their_s):
+    row_s, other_s = np.array(first_s, dtype=float), np.array(second_s, dtype=float)
+    best = np.full(len(row_s), -1)
+    if len(row_s) > len(other_s):
         back = _nearest(second_s, first_s)
         best[back[back >= 0]] = np.flatnonzero(back >= 0)
         return best
-    own, order = mine_s[np.isfinite(mine_s)], np.argsort(their_s)
-    ends = their_s[order][np.isfinite(their_s[order])]
-    if len(own) < 3 or len(ends) < 3:
+    finite_s, order = row_s[np.isfinite(row_s)], np.argsort(other_s)
+    ends = other_s[order][np.isfinite(other_s[order])]
+    if len(finite_s) < 3 or len(ends) < 3:
         return best
     # A fifth of the usual step is no other row's.
-    within, most = 0.2 * float(np.median(np.diff(np.sort(own)))), 0
-    offsets = np.concatenate([[0.0], (ends[:200, None] - own[:2]).ravel()])
+    within, most = 0.2 * float(np.median(np.diff(np.sort(finite_s)))), 0
+    offsets = np.concatenate([[0.0], (ends[:200, None] - finite_s[:2]).ravel()])
     for offset in offsets[np.argsort(np.abs(offsets), kind="stable")]:
-        after = np.searchsorted(ends, mine_s + offset).clip(1, len(ends) - 1)
-        at = after - (mine_s + offset - ends[after - 1] <= ends[after] - mine_s - offset)
-        near = np.abs(ends[at] - mine_s - offset) <= within
+        after = np.searchsorted(ends, row_s + offset).clip(1, len(ends) - 1)
+        at = after - (row_s + offset - ends[after - 1] <= ends[after] - row_s - offset)
+        near = np.abs(ends[at] - row_s - offset) <= within
         if (count := len({*at[near]})) > most and count == near.sum():
             best, most = np.where(near, order[at], -1), count
     return best

@@ -84,8 +84,8 @@ def _stops(lines: _Lines) -> list[_Lines]:
         is_regular = same == {once.sum()} or 2 * once.sum() >= words.total()
         marks = once if is_regular else counts == 0
         marks = np.array(named) == most if count > 2 else marks
-    if 2 * len(own := np.flatnonzero(marks & (counts > 0))) > marks.sum():
-        return [lines[at:end] for at, end in pairwise([*own.tolist(), len(lines)])]
+    if 2 * len(starts := np.flatnonzero(marks & (counts > 0))) > marks.sum():
+        return [lines[at:end] for at, end in pairwise([*starts.tolist(), len(lines)])]
     events = np.flatnonzero(marks | (counts > 0))
     steps = np.diff(marks[events].astype(int), prepend=0)
     tops, below = events[steps > 0], events[steps < 0]

@@ -205,11 +205,11 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
     if corners is not None:
         ids = corners.points.copy()
         for view in (view for view in session.views if view.number in chosen):
-            own = corners.views == view.number
+            in_view = corners.views == view.number
             points = corner_positions(boards[session.board_of(view)])
-            turned = apply(right_from_read, points)[ids[own]]
+            turned = apply(right_from_read, points)[ids[in_view]]
             away = np.linalg.norm(turned[:, None] - points, axis=-1)
-            ids[own] = away.argmin(axis=1)
+            ids[in_view] = away.argmin(axis=1)
         corners = replace(corners, points=ids)
     by = f"{degrees:g} deg" if degrees else "({:g}, {:g}) mm".format(*centre)
     note = f"the board was turned back by {by} in views {ranges(chosen)}"
@@ -258,8 +258,8 @@ def _turn_pictures(session: Session, chosen: Sequence[int], degrees: float) -> S
                     culprits=["resolution"],
                     next_step="Write resolution = [width, height] of upright pictures in [camera].",
                 )
-            own = corners.views == view.number
-            px[own] = turned_back(px[own], size, quarters)
+            in_view = corners.views == view.number
+            px[in_view] = turned_back(px[in_view], size, quarters)
         corners = replace(corners, px=px)
     back_turn = Rotation.from_euler("z", -degrees, degrees=True).as_matrix()
     poses = compose(back_turn, np.zeros(3)) @ numbers_in(session, MEASURED_CAM_POSE).poses()
@@ -377,8 +377,8 @@ def scale_board(session: Session, name: str, factor: float) -> Session:
         if only:
             tables = document["targets"]
             # A table of the target, or its file alone.
-            own = {} if isinstance(tables[only], str) else tables[only]
-            document["targets"] = {**tables, only: {**own, "target": file} if own else file}
+            table = {} if isinstance(tables[only], str) else tables[only]
+            document["targets"] = {**tables, only: {**table, "target": file} if table else file}
         else:
             document["target"] = file
         is_one = len(stated) == 1
@@ -425,7 +425,10 @@ def without_stated_lenses(session: Session) -> Session:
     """
     document, freed = {**session.document}, list[str]()
     tables = {"camera": document.get("camera")}
-    tables |= {f"cameras.{name}": own for name, own in document.get("cameras", {}).items()}
+    tables |= {
+        f"cameras.{name}": camera_table
+        for name, camera_table in document.get("cameras", {}).items()
+    }
     for name, table in tables.items():
         if table is not None and "matrix" in table:
             rest = {key: value for key, value in table.items() if key not in _OF_LENS}

@@ -87,10 +87,12 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     split, states = split_states(every, requested), [t for t in tables if t.joints]
     states = states or [*(t for t in tables if t.poses), *split]
     parts = parts_of_poses(every) if split else set[str]()
-    alone = [t for t in of_points if t not in states and t.fields.name not in parts]
-    points = next(iter(alone or sorted(of_points, key=lambda table: not table.is_measured)), None)
+    points_only = [t for t in of_points if t not in states and t.fields.name not in parts]
+    points = next(
+        iter(points_only or sorted(of_points, key=lambda table: not table.is_measured)), None
+    )
     states.sort(key=lambda t: points is None or len(t.fields) != len(points.fields))
-    state = next((t for t in states if (t is points) != bool(alone)), None)
+    state = next((t for t in states if (t is points) != bool(points_only)), None)
     if points is None or (state is points and points.poses and not points.is_measured):
         listed = "; ".join(table.fields.listing() for table in tables)
         raise DataError(
@@ -111,7 +113,9 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         )
     if state is points:
         return _recording(points, state, requested)
-    points, notes = together(alone, len(state.fields)) if alone and not given else (points, ())
+    points, notes = (
+        together(points_only, len(state.fields)) if points_only and not given else (points, ())
+    )
     foreign = _recording(replace(points, poses=()), state, requested)
     return replace(foreign, notes=(*foreign.notes, *notes, *armless_note(foreign, requested)))
 
@@ -121,8 +125,8 @@ def _recording(points: PointTable, state: PointTable, requested: ImportOptions) 
     fields, robot = points.fields, state.fields
     places, notes = _places(points, requested)
     loads, at = _loads(points), np.arange(len(fields))
-    own = (*points.joints, *points.poses) if state is points else ()
-    stops, spots = _stops(points, loads, own)
+    state_names = (*points.joints, *points.poses) if state is points else ()
+    stops, spots = _stops(points, loads, state_names)
     if state is not points and (turns := in_turn(points, len(robot))):
         stops, spots, how = turns
         notes += (how,)
@@ -132,7 +136,7 @@ def _recording(points: PointTable, state: PointTable, requested: ImportOptions) 
         notes += (f"Points and the robot's states are paired by {how}.",)
         loads = {k: tuple(v[row] for row in at) for k, v in _loads(state).items()} | loads
     numbers = {stop: str(number) for number, stop in enumerate(dict.fromkeys(stops))}
-    used = {*next(iter(points.points().values()), ()), *own}
+    used = {*next(iter(points.points().values()), ()), *state_names}
     columns = {f"source_{name}": c for name, c in fields.texts.items() if name not in used} | loads
     columns |= {"stop": tuple(numbers[stop] for stop in stops), "point": tuple(spots)}
     for name in dict.fromkeys(name for row in places for name in row):
@@ -194,8 +198,8 @@ def _places(
             f"{', '.join(turns)} are taken for turns about the fixed axes x, y, z, as "
             "SpatialAnalyzer writes them; --camera-form names another form.",
         )
-    asked = replace(given, names=names + turns * (len(names) == 3), form=form, unit=unit)
-    numbers, more, _ = poses_from(fields, asked.names, asked, "camera")
+    probe_options = replace(given, names=names + turns * (len(names) == 3), form=form, unit=unit)
+    numbers, more, _ = poses_from(fields, probe_options.names, probe_options, "camera")
     return pose_cells(numbers, INSTRUMENT_POSITION + INSTRUMENT_QUATERNION), (*notes, *more)
 
 

@@ -27,15 +27,15 @@ def images_named(
     names: Sequence[str | None],
     base: Path,
     found: Sequence[FileGroup] = (),
-    asked: Sequence[FileGroup] | None = None,
+    given: Sequence[FileGroup] | None = None,
 ) -> tuple[Path | None, ...]:
     """(n,) paths of the images that rows name; of a missing image the one that the source states.
 
     Names are relative to `base`, or to the folder `images` in it, or of an image `found` in the
-    source; among `asked`, if given, they are matched by their names, else by the numbers in these.
-    Raises DataError.
+    source; among `given` ones, if any, they are matched by their names, else by the numbers in
+    these. Raises DataError.
     """
-    files = [file for group in (found if asked is None else asked) for file in group.files]
+    files = [file for group in (found if given is None else given) for file in group.files]
     folders = {"", *(file.parent.name for file in files)}
     by_name = {
         (folder, word): file
@@ -44,7 +44,7 @@ def images_named(
         for word in (file.stem, file.name)
     }
     numbers = [number_in(name) for name in names if name]
-    is_unique = asked is not None and len(set(numbers)) == len(numbers)
+    is_unique = given is not None and len(set(numbers)) == len(numbers)
     by_number = {number_in(file.name): file for file in files} if is_unique else {}
     by_number = by_number if len(by_number) == len(files) else {}
     paths: list[Path | None] = []
@@ -54,11 +54,11 @@ def images_named(
             *_, folder, plain = ("", *name.replace("\\", "/").split("/"))
             known = by_name.get((folder if folder in folders else "", plain))
             known = known or by_number.get(number_in(plain))
-            is_elsewhere = asked is not None or not is_inside(base / name, base)
+            is_elsewhere = given is not None or not is_inside(base / name, base)
             path = known if is_elsewhere else None
-            path = path or path_inside(base, name if asked is None else plain)
+            path = path or path_inside(base, name if given is None else plain)
             near = base / "images" / path.name
-            if asked is None and not path.exists():
+            if given is None and not path.exists():
                 path = near if is_inside(near, base) and near.exists() else known or path
         if path is not None and not is_image_name(path.name):
             raise DataError(
@@ -137,8 +137,8 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         )
     (chosen, match), how = ranked[0], ranked[0][1].how
     images = chosen.taken(match.rows)
-    both = [(place, file.name) for place, file in zip(fields.places, images, strict=True) if file]
-    ends = ", ".join(f"{place} with {name}" for place, name in dict.fromkeys((both[0], both[-1])))
+    pairs = [(place, file.name) for place, file in zip(fields.places, images, strict=True) if file]
+    ends = ", ".join(f"{place} with {name}" for place, name in dict.fromkeys((pairs[0], pairs[-1])))
     hint = "; --image-column names a column that names each row's image" * (how == HOW[-1])
     notes = [f"Rows and images are paired by {how}: {ends}{hint}."]
     left = [group.listed() for group in groups if not (group is chosen or group.is_depth)]
@@ -233,8 +233,8 @@ def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
     Rows without numbers count from one.
     """
     place = {number: at for at, number in enumerate(group.numbers)}
-    for own in (*fields.keys.found[HOW[1]].values(), range(1, len(fields) + 1)):
-        numbers = {number for number in own if isinstance(number, int)}
+    for keys in (*fields.keys.found[HOW[1]].values(), range(1, len(fields) + 1)):
+        numbers = {number for number in keys if isinstance(number, int)}
         fewer, more = sorted((numbers, {*place}), key=len)
         # Gaps in the numbers fit by chance less than numbers in a row.
         has_gaps = max(fewer, default=0) - min(fewer, default=0) >= len(fewer)
@@ -246,6 +246,6 @@ def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
         fits = (by for by in near if last + by in more and all(k + by in more for k in fewer))
         if steps := [*islice(fits, 9)]:
             for by in steps:
-                at = (place.get(k + sign * by, -1) if isinstance(k, int) else -1 for k in own)
+                at = (place.get(k + sign * by, -1) if isinstance(k, int) else -1 for k in keys)
                 yield Match(HOW[1], np.array([*at]))
             return

@@ -35,8 +35,8 @@ def split_states(rows: Sequence[Fields], requested: ImportOptions) -> list[Point
     for count in dict.fromkeys(map(len, files)):
         whole = [fields for fields in files if len(fields) == count]
         for merged in joined(whole, whole[0].name, whole[0].folder, prefixed=True):
-            asked = requested if given <= {*merged.numbers} else _without_names(requested)
-            table = PointTable.of(merged, whole[0].folder / whole[0].name, asked)
+            options = requested if given <= {*merged.numbers} else _without_names(requested)
+            table = PointTable.of(merged, whole[0].folder / whole[0].name, options)
             named = [item.names for item in possible_poses(merged) if item.is_named]
             pairs = [names for names in named if len(names) == 2]
             of_two = (table.poses, *pairs) if len(table.poses) == 2 else pairs[: len(pairs) == 1]

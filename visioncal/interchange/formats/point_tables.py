@@ -91,15 +91,15 @@ class PointTable:
         first = next((at for at, size in enumerate(sizes) if size > 2), len(lines))
         title = "\n".join(text for at, text in enumerate(lines) if at < first or text[:1] in "/#%")
         fields = _side_by_side(_by_axis(_with_headings(fields)))
-        own = {*fields.numbers, *fields.texts}
+        field_names = {*fields.numbers, *fields.texts}
         table = cls(fields, title, file.name)
-        taken = tuple(name for name in requested.camera.names if name in own)
+        taken = tuple(name for name in requested.camera.names if name in field_names)
         taken = taken or next(iter(table.points().values()), ())
-        joints = tuple(name for name in requested.joints if name in own)
+        joints = tuple(name for name in requested.joints if name in field_names)
         joints = joints or joint_names(fields, taken)
         if is_headerless(fields) and "joint" in fields.name.lower():
             joints = joints or tuple(fields.numbers)
-        given = tuple(name for name in requested.robot.names if name in own)
+        given = tuple(name for name in requested.robot.names if name in field_names)
         others = (*joints, *(taken if joints or table.is_measured else ()))
         poses = pose_names(fields, given, "robot", others, by_shape=False)
         return replace(table, joints=joints, poses=poses)

@@ -129,12 +129,12 @@ def check_radians(
 
     `guesses` says whether the command can try other readings, which the message then suggests.
     """
-    there, rotation = poses.present, poses.reading.rotation
+    is_present, rotation = poses.present, poses.reading.rotation
     radians = rotation == "rotation-vector" or rotation.endswith("-rad")
     is_degrees = rotation == "rotation-vector-deg" and requested.form is None
-    if not (radians or is_degrees) or not there.any():
+    if not (radians or is_degrees) or not is_present.any():
         return
-    largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
+    largest = np.abs(np.where(is_present[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
     if not is_degrees and largest[row] <= 2 * np.pi + 0.01:
         return

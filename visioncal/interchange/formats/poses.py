@@ -129,9 +129,9 @@ def _of_trackers(items: list[PoseFields], taken: Collection[str]) -> list[PoseFi
 def _called(items: list[PoseFields], *, is_single: bool) -> list[PoseFields]:
     """The only two poses, or one beside the other, with the sides that their names say."""
     called = {"".join(item.words): item for item in items}
-    for both in BOTH_SIDES if len(items) == 1 + is_single else ():
-        if called.keys() <= {*both}:
-            sides = dict(zip(both, FRAMES, strict=True))
+    for side_words in BOTH_SIDES if len(items) == 1 + is_single else ():
+        if called.keys() <= {*side_words}:
+            sides = dict(zip(side_words, FRAMES, strict=True))
             return [replace(item, words=(sides[name],)) for name, item in called.items()]
     return items
 
@@ -365,9 +365,11 @@ def pose_names(
 def _of_side(fields: Fields, name: str, whose: str) -> str:
     """The full name of a field; of equal ones in several files, that in the side's own."""
     known = dict.fromkeys([*fields.numbers, *fields.texts])
-    own = [word for word in known if word.endswith(f".{name}") and name not in known]
-    own = [word for word in own if PoseFields((word,), tuple(words_of(word))).sides == [whose]]
-    return own[0] if len(own) == 1 else fields.find(name)
+    candidates = [word for word in known if word.endswith(f".{name}") and name not in known]
+    candidates = [
+        word for word in candidates if PoseFields((word,), tuple(words_of(word))).sides == [whose]
+    ]
+    return candidates[0] if len(candidates) == 1 else fields.find(name)
 
 
 def _are_one(fields: Fields, items: Sequence[PoseFields]) -> bool:

@@ -113,17 +113,17 @@ def _paired_rows(table: TextTable, path: Path) -> Fields | None:
     numbers = [at for at in columns if at not in worded]
     # Of angles beside another side's quaternions the last cell is empty.
     cells = [[row[at] for at in numbers if row[at]] for row in rows]
-    sizes = [{len(cells[at]) for at in own.tolist()} for own in (first, second)]
-    fits = all(len(own) == 1 and own <= {*POSE_SIZES} for own in sizes)
-    fits &= all(is_number(cell) for own in cells for cell in own)
+    sizes = [{len(cells[at]) for at in side.tolist()} for side in (first, second)]
+    fits = all(len(counts) == 1 and counts <= {*POSE_SIZES} for counts in sizes)
+    fits &= all(is_number(cell) for row in cells for cell in row)
     if not fits or any(map(is_image_name, names)):
         return None
     records = [
         {
             f"{name}_pose": np.array(cells[at], dtype=float)
-            for name, at in zip(names, both, strict=True)
+            for name, at in zip(names, pair, strict=True)
         }
-        for both in zip(first.tolist(), second.tolist(), strict=True)
+        for pair in zip(first.tolist(), second.tolist(), strict=True)
     ]
     places = [table.place(at) for at in first.tolist()]
     return fields_of_records(records, places, path.stem, path.parent)
@@ -147,7 +147,7 @@ def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
     turns = position_first(numbers)[:, 3:] if is_short else split_matrices(numbers)[1]
     even, odd = turns[::2], turns[1::2]
     # Cosines of half the angle between two quaternions, of either sign, or traces.
-    first, second = (np.abs(own @ own.T) if is_short else own @ own.T for own in (even, odd))
+    first, second = (np.abs(side @ side.T) if is_short else side @ side.T for side in (even, odd))
     copied, apart = np.median(np.abs(even - odd)), np.median(np.abs(first - second))
     later = np.median(np.abs(first[1:, 1:] - second[:-1, :-1]))
     return bool(apart < _TURN_ALIKE * np.ptp(first) <= copied and 2.0 * apart < later)
@@ -442,14 +442,14 @@ def _opened(groups: Sequence[object], name: str) -> Iterator[_Rows]:
         lists = {key: each for key, each in group.items() if isinstance(each, list)}
         longest = max(map(len, lists.values()), default=0)
         parallel = {key: each for key, each in lists.items() if len(each) == longest > 1}
-        beside = {key: each for key, each in group.items() if key not in lists}
+        rest = {key: each for key, each in group.items() if key not in lists}
         is_inner = any(
             isinstance(cell, list | Mapping) for each in parallel.values() for cell in each
         )
         if not is_inner:
             return
         for cells in zip(*parallel.values(), strict=True):
-            rows.append({**beside, **dict(zip(parallel, cells, strict=True))})
+            rows.append({**rest, **dict(zip(parallel, cells, strict=True))})
     if len(rows) > len(groups):
         yield name, rows, ()
 

@@ -147,8 +147,8 @@ def convert(
         (remove_tool, mends.without_tool),
         (scale_board, mends.board_scale),
     )
-    for mend, asked in of_views:
-        session = session if asked is None else mend(session, *asked)
+    for mend, values in of_views:
+        session = session if values is None else mend(session, *values)
     for mend_whole, is_asked in (
         (without_stated_lenses, is_session and requested == _FREE_LENSES),
         (without_reported_poses, mends.by_joints),

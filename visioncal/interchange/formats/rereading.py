@@ -161,8 +161,8 @@ def applied_reading(
     makers = [form.name for form in forms if form.models and not foreign.form]
     # Columns A, B, C of turns about Z, Y, X are a KUKA's; roll, pitch, yaw may be any program's.
     named = [form for form in forms if form.name in foreign.makers]
-    own = named[0].name if len(named) == 1 and named[0].name in makers else ""
-    if own:
+    form_name = named[0].name if len(named) == 1 and named[0].name in makers else ""
+    if form_name:
         by = "By the names of the columns, poses are written as"
         notes.append(f"{by} {named[0].words}; --robot-form says another form.")
     elif makers:
@@ -173,7 +173,7 @@ def applied_reading(
         foreign,
         robot=numbers["robot"] or foreign.robot,
         camera=numbers["camera"],
-        form=own or foreign.form,
+        form=form_name or foreign.form,
         notes=(*kept, *notes),
         unstated={},
         rivals=(),
@@ -405,10 +405,10 @@ def _robot_table(
     found, declared = candidate.hypothesis.robot, candidate.recording.declared.robot
     if (found.rotation, found.written) != (declared.rotation, declared.written):
         table = {key: value for key, value in table.items() if key != "form"}
-    own = [name for name in doubtful.makers if POSE_FORMS[name].rotation == found.rotation]
-    if own:
-        table = {**table, "form": own[0]}
-    return {"robot": table} if own or stated is not None else {}
+    makers = [name for name in doubtful.makers if POSE_FORMS[name].rotation == found.rotation]
+    if makers:
+        table = {**table, "form": makers[0]}
+    return {"robot": table} if makers or stated is not None else {}
 
 
 def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:

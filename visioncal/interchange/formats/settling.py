@@ -140,9 +140,9 @@ def _check_motions(foreign: ForeignRecording) -> None:
     """
     if foreign.camera is None or foreign.stream is not None:
         return
-    both = [side.poses() for side in (foreign.robot, foreign.camera)]
-    has_both = np.isfinite(both).all(axis=(0, 2, 3))
-    robot, camera = (side[has_both] for side in both)
+    sides = [side.poses() for side in (foreign.robot, foreign.camera)]
+    has_both = np.isfinite(sides).all(axis=(0, 2, 3))
+    robot, camera = (side[has_both] for side in sides)
     if len(robot) < FEWEST_ROWS:
         return
     vectors = np.array([log(side) for side in (robot, camera)])
@@ -297,9 +297,9 @@ class _Seen:
         seen = with_observations_only(foreign)
         if not (seen.images or seen.corners):
             return cls(None, np.arange(0), (), min(len(seen.robot), most), progress)
-        there = [at for at, image in enumerate(seen.images) if image and image.is_file()]
-        there = there or [at for at, px in enumerate(seen.corners) if px is not None]
-        rows = np.array(there, dtype=int)[evenly(len(there), most)]
+        usable = [at for at, image in enumerate(seen.images) if image and image.is_file()]
+        usable = usable or [at for at, px in enumerate(seen.corners) if px is not None]
+        rows = np.array(usable, dtype=int)[evenly(len(usable), most)]
         run = None
         if len(rows) >= FEWEST_ROWS:
             session = assemble(rows_of(replace(seen, rivals=()), rows), mount=MOUNTS[0])
@@ -333,11 +333,13 @@ class _Seen:
         """Tries the readings of one recording's poses; raises VisioncalError."""
         item = with_observations_only(replace(foreign, rivals=()))
         if self.run is None:
-            here = (
+            is_readable = (
                 item.robot.present if item.robot.present.any() else np.full(len(item.robot), True)
             )
-            here &= np.full(len(here), True) if item.camera is None else item.camera.present
-            rows = np.flatnonzero(here)
+            is_readable &= (
+                np.full(len(is_readable), True) if item.camera is None else item.camera.present
+            )
+            rows = np.flatnonzero(is_readable)
             rows = rows[evenly(len(rows), self.count)]
             return DoubtfulSession.of(rows_of(item, rows)).guess(self.progress)
         knows_mount = foreign.mount is not None

@@ -281,21 +281,21 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
         later += 8 * (len(fields) < FEWEST_ROWS)
         # A list of a few poses beside many of the robot's is of checks.
         later += 8 * (2 * len(fields) < max(of_robot, default=0))
-        asked = _with_joints(fields, requested)
-        joints = asked.joints or joint_names(fields, ())
+        options = _with_joints(fields, requested)
+        joints = options.joints or joint_names(fields, ())
         is_given = bool(requested.robot.names) or not _has(fields, given)
         camera = () if is_given else pose_names(fields, requested.camera.names, "camera", joints)
         others = (*joints, *camera) if requested.camera.names else joints
         groups = [] if is_given else ranked_poses(fields, "robot", others)
         named = pose_names(fields, (), "robot", others) if is_seen or not joints else ()
         if is_given or named or requested.joints or (joints and (is_seen or not groups)):
-            found.append((later + len(groups) * (not named), fields, asked))
+            found.append((later + len(groups) * (not named), fields, options))
         for rank, item in ((rank, item) for rank, group in enumerate(groups) for item in group):
             # Beside joint angles the pose is what was seen.
             if joints and not is_seen and item.sides != ["robot"]:
-                of_item = replace(asked, camera=replace(requested.camera, names=item.names))
+                of_item = replace(options, camera=replace(requested.camera, names=item.names))
             else:
-                of_item = replace(asked, robot=replace(requested.robot, names=item.names))
+                of_item = replace(options, robot=replace(requested.robot, names=item.names))
             if item.names != named and not (named and rank == 0 and item.is_like(named, fields)):
                 found.append((later + rank, fields, of_item))
     faults = [part.fault for part in source.parts if part.fault and not part.lenses]
@@ -388,8 +388,10 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
     step, options = "", list[str]()
     if possible:
         fields, robot = possible[0]
-        own = {*robot.names}
-        others = [each for of, each in possible[1:] if of is fields and not own & {*each.names}]
+        robot_names = {*robot.names}
+        others = [
+            each for of, each in possible[1:] if of is fields and not robot_names & {*each.names}
+        ]
         others = [item for item in others if item.sides != ["robot"]]
         # Both sides of a recording have as many poses; a file with more is of other pictures.
         lengths = {each.name: len(each) for part in source.parts for each in part.rows}
@@ -459,8 +461,8 @@ def _of_one_file(source: Source, requested: ImportOptions, names: Sequence[str])
     step += "the recording"
     options = list[str]()
     if images is not None:
-        alone = [group for group in groups if group.files[0].parent == images.files[0].parent]
-        pictures = images.files[0] if len(alone) > 1 else images.files[0].parent
+        same_folder = [group for group in groups if group.files[0].parent == images.files[0].parent]
+        pictures = images.files[0] if len(same_folder) > 1 else images.files[0].parent
         step += f", as {file.name}, of as many rows as there are images in {images.label}"
         options = [] if requested.images else ["--images", str(pictures)]
     if not requested.command:

@@ -92,16 +92,18 @@ def _of_camera(path: Path) -> dict[str, tuple[int, ...]]:
 
 def series_note(fields: Fields, others: Sequence[Fields]) -> tuple[str, ...]:
     """A note on other series of the same fields in the same file, which are not read."""
-    own, keys = _series(fields)
+    chosen, keys = _series(fields)
     named = ((each, *_series(each)) for each in others)
     alike = {
         series: f"{series} ({counted(len(each), 'row')})"
         for each, series, names in named
-        if own and series not in ("", own) and names == keys
+        if chosen and series not in ("", chosen) and names == keys
     }
     if not alike:
         return ()
-    note = f"Of several series {own} is read; left aside: {some_of([*alike.values()])}, for files"
+    note = (
+        f"Of several series {chosen} is read; left aside: {some_of([*alike.values()])}, for files"
+    )
     return (f"{note} of their own.",)
 
 
@@ -219,13 +221,13 @@ def _named(item: PoseFields) -> str:
 
 def points_beside(fields: Fields, robot: tuple[str, ...]) -> tuple[str, ...]:
     """The only points of another file than the robot's poses, or of a camera by their words."""
-    own = robot[0].partition(".")[0]
+    robot_file = robot[0].partition(".")[0]
     poses = {name for item in possible_poses(fields, robot) for name in item.names}
     found = [
         item.names
         for item in points_in(fields)
         for file in [item.names[0].partition(".")[0]]
-        if item.sides == ["camera"] or (file != own and f"{file}." in fields.places[0])
+        if item.sides == ["camera"] or (file != robot_file and f"{file}." in fields.places[0])
         if {*item.names}.isdisjoint({*robot, *poses})
     ]
     return found[0] if len(found) == 1 else ()

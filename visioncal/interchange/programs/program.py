@@ -47,9 +47,9 @@ class Use:
 
     def is_like(self, others: Sequence["Use"]) -> bool:
         """Whether others have the same frames, or need none."""
-        mine = np.concatenate([self.base, self.tool])
+        frames = np.concatenate([self.base, self.tool])
         theirs = (np.concatenate([each.base, each.tool]) for each in others)
-        return self.literal.are_joints or all(np.array_equal(mine, each) for each in theirs)
+        return self.literal.are_joints or all(np.array_equal(frames, each) for each in theirs)
 
 
 @dataclass

@@ -89,9 +89,9 @@ class _Reader:
     def _frame(self, kind: str, label: str) -> Frame:
         if label.lower() in ("tool0", "wobj0"):
             return np.eye(4)
-        own = self.known.get(f"{kind} {label.lower()}")
-        own = self._frames(f"{kind} {label}") if own is None else own
-        return f"{kind} {label}" if own is None else own
+        frame = self.known.get(f"{kind} {label.lower()}")
+        frame = self._frames(f"{kind} {label}") if frame is None else frame
+        return f"{kind} {label}" if frame is None else frame
 
     def _move(self, each: re.Match[str], place: str) -> None:
         arguments = _arguments(each[2])
