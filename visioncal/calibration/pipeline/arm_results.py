@@ -68,12 +68,12 @@ def covariance_from_other_sources(
         levels = expected_levels(problem, fit.state, fit.noise)
         # Where an arm has errors that are not estimated, the noise is what remains beside them, not
         # the expected level of a fit without them.
-        beside = [
+        unestimated = [
             problem.robots.index(robot)
             for robot, arm in arms.items()
             if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated
         ]
-        levels[beside] = fit.noise.robots[beside]
+        levels[unestimated] = fit.noise.robots[unestimated]
         noise = replace(fit.noise, robots=levels)
         raised = replace(fit, solution=replace(fit.solution, noise=noise))
         parts["noise_level"] = raised.by_noise - fit.by_noise
@@ -181,8 +181,8 @@ def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
         # errors are to be significant.
         sized = with_free_sizes(fit) if errors.is_significant else fit
         if sized is not fit:
-            beside = find_pose_errors(sized.problem, sized.state, sized.noise, name)
-            gain = errors.gain if beside is None else min(errors.gain, beside.gain)
+            sized_errors = find_pose_errors(sized.problem, sized.state, sized.noise, name)
+            gain = errors.gain if sized_errors is None else min(errors.gain, sized_errors.gain)
             errors = replace(errors, gain=gain)
         return replace(errors, of_session=random_effect_rms(fit.problem, fit.state, name))
 

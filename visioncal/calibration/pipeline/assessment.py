@@ -170,10 +170,10 @@ def assess_fit(
         steps = steps_of(replace(fit, solution=converged), errors, offsets)
         arms = with_errors_beside_step(cell_fit.arms, fit, steps)
         cell_fit = replace(cell_fit, arms=arms)
-    beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
+    by_source = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
     if cell_fit.has_links and (between := between_boards_and_arm(fit, cell.session.boards)).any():
-        beside[BOARD_OR_ARM] = between
-    fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, by_source=beside)
+        by_source[BOARD_OR_ARM] = between
+    fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, by_source=by_source)
     held_out = left_out(cell_fit)
     (faults, reasons, marginal), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(
@@ -319,11 +319,11 @@ def _problem(cell_fit: CellFit, observed: Observed, views: Sequence[ViewPoses]) 
     problem = replace(problem, observations=observations, points=fitted.points)
     edges = State(cell_fit.fit.state.edges, np.zeros(0))
     creeps = [Creep.at(problem, edges, at.frame, at.rate) for at in creep_effects(fitted)]
-    own = {
+    known = {
         effect.name: effect for effect in (*clock_effects(cell_fit.cell, observed.clocks), *creeps)
     }
     effects = [
-        own.get(effect.name)
+        known.get(effect.name)
         or replace(
             effect, by_sensor=None, rows_concerned=None if effect.rows_concerned is None else none
         )

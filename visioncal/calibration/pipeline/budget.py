@@ -53,8 +53,11 @@ def left_out(cell_fit: CellFit) -> HeldOutResiduals:
             predicted = part.predicted(state)
             off_m, off_rad = pose_residuals(part, state, predicted)
             away_m[held], away_rad[held] = off_m[held], off_rad[held]
-            mine = used[held].tolist()
-            seen = [cell_fit.cell.rows[at] for at in mine], [cell_fit.poses[at] for at in mine]
+            held_rows = used[held].tolist()
+            seen = (
+                [cell_fit.cell.rows[at] for at in held_rows],
+                [cell_fit.poses[at] for at in held_rows],
+            )
             rms_px[held] = cell_fit.pixels(*seen, predicted[held], state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(part) else "stops"
@@ -101,8 +104,8 @@ def uncertainty_of(cell_fit: CellFit, fit: Fit) -> UncertaintyResult:
         for name, edge in _covariances_of_edges(cell_fit, fit).items()
     }
     limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
-    both = fit.covariance((EDGE, camera), (EDGE, target))
-    values = np.linalg.eigvalsh(both / np.outer(limits, limits))
+    joint = fit.covariance((EDGE, camera), (EDGE, target))
+    values = np.linalg.eigvalsh(joint / np.outer(limits, limits))
     return UncertaintyResult(
         point_cam_m=point_cam,
         distances_m=np.array([distances_m.min(), distances_m.max()]),

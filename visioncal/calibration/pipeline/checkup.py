@@ -231,8 +231,8 @@ def _contents(run: RunState) -> Iterator[str]:
     yield counted(len(session.views), "view")
     images = [view.image for view in session.views if view.image]
     if images:
-        there = sum(session.images.exists(image) for image in images)
-        yield f"{there} of {counted(len(images), 'image')}"
+        existing = sum(session.images.exists(image) for image in images)
+        yield f"{existing} of {counted(len(images), 'image')}"
     for look in run.cameras.values():
         seen = f"the board in {counted(len(look.corners), 'image' if images else 'view')}"
         px = np.vstack([np.zeros((0, 2)), *(at.px for at in look.corners.values())])

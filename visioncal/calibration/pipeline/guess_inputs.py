@@ -194,10 +194,10 @@ def chain_fit(
     base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
 ) -> Fit | None:
     """The robust fit of the chain of one robot; None of too few views."""
-    _, both = both_sides(base_from_flange, seen, mount)
-    if len(both) < FEWEST_ROWS:
+    _, pairs = both_sides(base_from_flange, seen, mount)
+    if len(pairs) < FEWEST_ROWS:
         return None
-    return robust_fits(robot_part(both[:, 0], mount)[None], both[:, 1][None])[0]
+    return robust_fits(robot_part(pairs[:, 0], mount)[None], pairs[:, 1][None])[0]
 
 
 def both_sides(
@@ -205,5 +205,5 @@ def both_sides(
 ) -> tuple[IntArray, FloatArray]:
     """(m,) views, and (m, 2, 4, 4) poses of the robot and of the target by each image alone."""
     alike = alike_turning(base_from_flange, seen, mount)
-    both = [(base_from_flange[view], pose) for view, pose in alike.items()]
-    return np.array([*alike], dtype=int), np.array(both).reshape(-1, 2, 4, 4)
+    pairs = [(base_from_flange[view], pose) for view, pose in alike.items()]
+    return np.array([*alike], dtype=int), np.array(pairs).reshape(-1, 2, 4, 4)

@@ -89,7 +89,7 @@ def findings_of(run: RunState) -> Findings:
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst = _worst(run)
     return Findings(
-        _pairs(connected, explained | answer.marginal, answer, alone=run.mount is not None),
+        _pairs(connected, explained | answer.marginal, answer, is_single=run.mount is not None),
         _sensors(connected, run),
         _arms(run),
         worst,
@@ -112,9 +112,9 @@ def _is_by_lens(run: RunState, worst: Sequence[Direction]) -> bool:
         return False
     inner, names = fit.whole[np.ix_(lens, lens)], chain_words(fit.problem, run.mount).names
     known = fit.whole - fit.whole[:, lens] @ np.linalg.pinv(inner, hermitian=True) @ fit.whole[lens]
-    beside = [found for _, found in directions(fit.problem, fit.state, known, names)]
+    given_lens = [found for _, found in directions(fit.problem, fit.state, known, names)]
     at = max(range(len(worst)), key=lambda at: worst[at].sigma / worst[at].limit)
-    return bool(beside[at].sigma ** 2 < _LEAVES * worst[at].sigma ** 2)
+    return bool(given_lens[at].sigma ** 2 < _LEAVES * worst[at].sigma ** 2)
 
 
 def _use(run: RunState) -> Remedy:
@@ -202,24 +202,28 @@ def _absorbing(run: RunState) -> Iterator[str]:
 
 
 def _pairs(
-    views: Sequence[ViewResult], explained: Collection[int], answer: FitAssessment, *, alone: bool
+    views: Sequence[ViewResult],
+    explained: Collection[int],
+    answer: FitAssessment,
+    *,
+    is_single: bool,
 ) -> list[JudgedPair]:
     """Results by camera and target; all in one for one camera and one robot."""
     by_pair: dict[tuple[str, str], list[ViewResult]] = {}
     for view in views:
-        by_pair.setdefault(("", "") if alone else (view.seer, view.seen), []).append(view)
+        by_pair.setdefault(("", "") if is_single else (view.seer, view.seen), []).append(view)
     return [
         JudgedPair(
-            mine,
+            pair_views,
             [
                 Rejection(view.view, view.reason)
-                for view in mine
+                for view in pair_views
                 if _is_outlier(view) and view.view not in explained
             ],
             f"{seer} of {seen}" if len(by_pair) > 1 else "",
-            *_weighted_rms(answer, mine),
+            *_weighted_rms(answer, pair_views),
         )
-        for (seer, seen), mine in by_pair.items()
+        for (seer, seen), pair_views in by_pair.items()
     ]
 
 
@@ -256,15 +260,15 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
     undone = {at for found in run.warnings if found.kind in UNDONE for at in found.views}
     sensors = []
     for seer in seers:
-        mine = [view for view in views if view.seer == seer]
-        unused = [view for view in mine if not view.used and view.view not in not_needed]
+        seer_views = [view for view in views if view.seer == seer]
+        unused = [view for view in seer_views if not view.used and view.view not in not_needed]
         sensors.append(
             Sensor(
-                used=sum(view.used for view in mine),
+                used=sum(view.used for view in seer_views),
                 lost=[Rejection(view.view, view.reason) for view in unused],
-                outliers=[v.view for v in mine if _is_outlier(v) or v.view in undone],
+                outliers=[v.view for v in seer_views if _is_outlier(v) or v.view in undone],
                 pixel_px=run.cell_fit.fit.shown_px(seer),
-                spared=sum(view.view in run.spared for view in mine),
+                spared=sum(view.view in run.spared for view in seer_views),
                 name=seer if len(seers) > 1 else "",
             )
         )

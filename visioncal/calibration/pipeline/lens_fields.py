@@ -43,8 +43,8 @@ def lens_field_of(fit: Fit, camera: str) -> LensField | None:
         fitted = coefficients.moving_roots @ fit.values(beyond)
         mean = (coefficients.mean + slope @ change + fitted) / noise_px
         rest = coefficients.rest @ coefficients.rest.T
-        own = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
-        root = _root(own, optics.camera(camera), levels)
+        covariance_px = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
+        root = _root(covariance_px, optics.camera(camera), levels)
     with_lens = np.zeros((len(mean), len(fit.values(lens))))
     with_lens[:, fit.unknowns.values_of(lens)] = (
         jacobian @ covariance[:, fit.unknowns.columns(lens)] / noise_px

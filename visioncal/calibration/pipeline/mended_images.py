@@ -59,12 +59,16 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
         images[name], how = _sized(image, usual, files[name])
         done[name] += how
     for board, target in session.boards.items():
-        mine = [view for view in present if session.board_of(view) == board]
-        some = [images[view.image] for view in spread(mine, LOOKED_AT_LAST) if view.image in images]
+        board_views = [view for view in present if session.board_of(view) == board]
+        some = [
+            images[view.image]
+            for view in spread(board_views, LOOKED_AT_LAST)
+            if view.image in images
+        ]
         shown = None
         with suppress(DataError):
             shown = identify([*map(grey_of, some)], target) if some else None
-        for name in {view.image for view in mine if shown is not None} & images.keys():
+        for name in {view.image for view in board_views if shown is not None} & images.keys():
             if shown is not None and shown.is_mirrored:
                 images[name] = np.ascontiguousarray(images[name][:, ::-1])
                 done[name].append("mirrored back")
@@ -153,10 +157,10 @@ def _with_mended_corners(session: Session) -> Session | None:
     sigmas_px = None if table.sigmas_px is None else table.sigmas_px.copy()
     for share in dict.fromkeys(found.shares.values()):
         views = [view for view, of in found.shares.items() if of == share]
-        own = np.isin(table.views, views)
-        px[own] = scaled_px(px[own], 1.0 / share)
+        in_views = np.isin(table.views, views)
+        px[in_views] = scaled_px(px[in_views], 1.0 / share)
         if sigmas_px is not None:
-            sigmas_px[own] /= share
+            sigmas_px[in_views] /= share
         notes.append(f"the corners of view {ranges(views)} were scaled by {1.0 / share:g}")
     mended = replace(table, px=px, sigmas_px=sigmas_px)
     return _with_corners(session, mended, notes) if notes else None
@@ -166,8 +170,8 @@ def _exchanged_back(session: Session, views: Collection[int]) -> Session:
     """The session with u and v of the corners of some views exchanged."""
     corners = session.corner_table
     if corners is not None:
-        own = np.isin(corners.views, [*views])
-        px = np.where(own[:, None], corners.px[:, ::-1], corners.px)
+        in_views = np.isin(corners.views, [*views])
+        px = np.where(in_views[:, None], corners.px[:, ::-1], corners.px)
         corners = replace(corners, px=px)
     notes = [f"{_EXCHANGED} of view {ranges(views)} were exchanged"]
     return _with_corners(session, corners, notes)

@@ -112,8 +112,8 @@ class ObservedPoses(Observed):
         Views of one stop share the robot's error. Of measured poses, the noise is not separated
         from the robot's: each then has a stop of its own.
         """
-        own = any(self.poses[view].corners is None for view in views)
+        are_measured = any(self.poses[view].corners is None for view in views)
         keys: dict[tuple[int, int], int] = {}
         stations = {row.view.number: row.station for row in self.timed.observations}
-        both = ((stations[view], view if own else 0) for view in views)
-        return np.array([keys.setdefault(pair, len(keys)) for pair in both], dtype=np.int64)
+        pairs = ((stations[view], view if are_measured else 0) for view in views)
+        return np.array([keys.setdefault(pair, len(keys)) for pair in pairs], dtype=np.int64)

@@ -224,9 +224,9 @@ def _joint_fit(run: RunState) -> JointFit | None:
 
 def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
     """The residuals of each board at each stop; None where a frame or a clock moved."""
-    assessment, beside = run.assessment, run.cell_fit.other_effects
-    unknown = {effect.name for effect in of_random_effects(beside)} | {SIZE}
-    if assessment.moved or any(effect.name not in unknown for effect in beside):
+    assessment, other_effects = run.assessment, run.cell_fit.other_effects
+    unknown = {effect.name for effect in of_random_effects(other_effects)} | {SIZE}
+    if assessment.moved or any(effect.name not in unknown for effect in other_effects):
         return None
     # Of what grew with time or reach, and of a size by which poses were measured, a check knows
     # nothing: it is in the residuals.
@@ -372,10 +372,10 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
         result = CameraResult(fit.camera(name), estimated, field=lens_field_of(fit, name))
         if len(free):
             size = len(fit.values(lens))
-            own, cross = np.zeros((size, size)), np.zeros((size, len(edges)))
-            own[np.ix_(free, free)] = fit.covariance(lens)
+            lens_covariance, cross = np.zeros((size, size)), np.zeros((size, len(edges)))
+            lens_covariance[np.ix_(free, free)] = fit.covariance(lens)
             cross[free] = fit.whole[np.ix_(columns, edges)]
-            result = replace(result, covariance=own, edge_covariance=cross)
+            result = replace(result, covariance=lens_covariance, edge_covariance=cross)
         cameras[name] = result
     return cameras
 

@@ -175,8 +175,8 @@ def _with_own_lens(cell_fit: CellFit, observed: Observed) -> CellFit:
         return cell_fit
     # The views that are left may be too few for a lens, as the session's are not.
     with suppress(VisioncalError, np.linalg.LinAlgError):
-        own = replace(cell_fit, apart=apart, linearised_corners=None)
-        return _fit_with_inliers(own, observed)
+        reduced = replace(cell_fit, apart=apart, linearised_corners=None)
+        return _fit_with_inliers(reduced, observed)
     return cell_fit
 
 

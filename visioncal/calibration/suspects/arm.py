@@ -32,12 +32,12 @@ def _found(run: RunState) -> Iterator[Finding]:
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         levels = () if arm.kinematics is None else (*findings(arm.kinematics),)
         mounting = other_mounting(run, arm)
-        # Encoders, zeros and springs are those of the wrong one.
+        # Encoders, zeros and springs are those of an arm that is mounted otherwise.
         found = () if mounting is not None else reports[name].notes
         notes = remarks((*drifts, *levels, *found), NOTE)
         stops = len(stops_of(run.assessment.fit.problem, name))
-        own = (*([mounting] if mounting else []), *_of(arm, run.cell_fit.level, stops))
-        for finding in (*own, *reports[name].doubts, *notes):
+        arm_findings = (*([mounting] if mounting else []), *_of(arm, run.cell_fit.level, stops))
+        for finding in (*arm_findings, *reports[name].doubts, *notes):
             yield finding.of("" if len(arms) == 1 else f"Robot {name}")
 
 

@@ -121,10 +121,10 @@ def _of_measured_poses(run: RunState) -> Iterator[Finding]:
     if (measured := size_of_measured(run.cell_fit, run.assessment.fit)) is not None:
         if measured.is_another and measured.contradicts:
             words = " The result takes the robot's scale, beside errors of the arm's lengths."
-            beside = words if run.cell_fit.has_links else " The result takes the robot's scale."
+            further = words if run.cell_fit.has_links else " The result takes the robot's scale."
             # Slopes are those at predicted poses.
             share = measured.scale / (1.0 - measured.scale)
-            yield other_size(share, measured.sigma**2, beside)
+            yield other_size(share, measured.sigma**2, further)
         return
     # The camera may have a name.
     (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))

@@ -163,8 +163,8 @@ def _may_be_of_arm(run: RunState) -> bool:
 
 def _of_step(run: RunState, _: str) -> Trial:
     fit = run.assessment.sized
-    own = fit.problem, fit.solution
-    return Trial(own, with_step(*own, run.assessment.steps[0]), is_in_fit=False)
+    without = fit.problem, fit.solution
+    return Trial(without, with_step(*without, run.assessment.steps[0]), is_in_fit=False)
 
 
 def _held(run: RunState, columns: IntArray, at: FloatArray | float = 0.0) -> Trial:
@@ -172,8 +172,8 @@ def _held(run: RunState, columns: IntArray, at: FloatArray | float = 0.0) -> Tri
     fit, first = run.assessment.fit, 6 * len(run.assessment.fit.frames)
     problem, effects = fit.problem, []
     for effect in problem.effects:
-        own = problem.effect_columns[effect.name]
-        held = effect.held | np.isin(np.arange(own.start, own.stop), columns)
+        places = problem.effect_columns[effect.name]
+        held = effect.held | np.isin(np.arange(places.start, places.stop), columns)
         effects.append(replace(effect, held=held))
     values = fit.state.values.copy()
     values[columns - first] = at
@@ -185,7 +185,7 @@ def _held(run: RunState, columns: IntArray, at: FloatArray | float = 0.0) -> Tri
 def _of_growth(run: RunState, kind: str) -> Trial:
     unknowns, sizes = run.assessment.fit.unknowns, run.cell_fit.sizes
     columns = {owner: unknowns.columns((kind, owner)) for owner in unknowns.of(kind)}
-    taken = [0.0 * own + sizes.steadied_by(kind, owner) for owner, own in columns.items()]
+    taken = [0.0 * at + sizes.steadied_by(kind, owner) for owner, at in columns.items()]
     return _held(run, np.concatenate([*columns.values()]), -np.concatenate(taken))
 
 
@@ -195,8 +195,8 @@ def _of_board(run: RunState, kind: str) -> Trial:
     if sizes := fit.unknowns.all_of(SIZE):
         return _held(run, fit.unknowns.columns(*sizes))
     if kind == "board_size" and sized.unknowns.all_of(SIZE):
-        own, cured = ((at.problem, at.solution) for at in (fit, sized))
-        return Trial(own, cured, is_in_fit=False)
+        stated, cured = ((at.problem, at.solution) for at in (fit, sized))
+        return Trial(stated, cured, is_in_fit=False)
     columns = [
         fit.unknowns.columns(board)[
             (fit.unknowns.values_of(board) == SCALE) == (kind == "board_size")

@@ -40,8 +40,8 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
 
 def _suspect(kind: str) -> Suspect:
     """The suspect of a kind: a pick errs by it as views do, and what no view shows is no motion."""
-    effect, own = KINDS[kind], ("robot_noise", "robot_noise_of_pick", UNEXPLAINED)
-    inflated: tuple[str, ...] = () if issubclass(effect, LensEffect) else own
+    effect, sources = KINDS[kind], ("robot_noise", "robot_noise_of_pick", UNEXPLAINED)
+    inflated: tuple[str, ...] = () if issubclass(effect, LensEffect) else sources
     inflated += ("calibration",) if issubclass(effect, BracketBends) else ()
     return Suspect(kind, partial(_found, kind), 1e-4, True, effect.hides, inflated)
 

@@ -65,8 +65,10 @@ def judge(findings: Findings) -> Verdict:
         warnings = [found for found in warnings if not SUSPECTS[found.kind].of_result]
         doubts = [doubt for doubt in doubts if not SUSPECTS[doubt.kind].of_result]
         findings, picks = replace(findings, warnings=warnings, picks=()), ()
-    own = [pick.uncorrected or pick for pick in picks] if is_calibrated else []
-    worst, uncorrected = (least_precise(some) if some else None for some in (picks, own))
+    uncorrected_picks = [pick.uncorrected or pick for pick in picks] if is_calibrated else []
+    worst, uncorrected = (
+        least_precise(some) if some else None for some in (picks, uncorrected_picks)
+    )
     good_for_mm, uncorrected_mm = (_good_for_mm(pick, found) for pick in (worst, uncorrected))
     stated: list[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     if status != "good":
@@ -145,12 +147,12 @@ def _good_for(
     where = "at" if is_read else "where the views looked, at"
     sensor = "instrument" if is_read else "camera"
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
-    limit, alone = (figure(rounded_up(mm)) for mm in (good_for_mm, worst.good_for_mm))
+    limit, picks_limit = (figure(rounded_up(mm)) for mm in (good_for_mm, worst.good_for_mm))
     without_doubts = ""
     likely = [found for found in stated if found.probability >= LEAST_LIKELY]
-    if alone != limit:
+    if picks_limit != limit:
         # The doubts decide, not the predicted picks.
-        without_doubts = f", whatever is behind the doubts; if mere noise is, of {alone} mm"
+        without_doubts = f", whatever is behind the doubts; if mere noise is, of {picks_limit} mm"
     elif any(
         "calibration" in SUSPECTS[found.kind].inflates
         for found in in_reading_order(likely, status)[:1]

@@ -69,9 +69,9 @@ def by_joints(run: RunState) -> Iterator[Finding]:
     camera = np.array([seen[view].cam_from_target[0] for view in late])
     poses = np.array([[of[view] for view in late] for of in (reported, by_model)])
     sides, edges = robot_part(poses, run.mount), (by_angles.x, by_angles.z)
-    own, right = (residuals_of(side, camera, by_angles.lever, edges) for side in sides)
+    stated, right = (residuals_of(side, camera, by_angles.lever, edges) for side in sides)
     is_right = right.residuals < CLEAR_RATIO * by_angles.score
-    some = np.flatnonzero(is_right & (CLEAR_RATIO * right.residuals < own.residuals))
+    some = np.flatnonzero(is_right & (CLEAR_RATIO * right.residuals < stated.residuals))
     # Views whose joint angles are wrong, too, are said to be so for each.
     if len(some) == len(matched.contradicting):
         named = tuple(late[at] for at in some.tolist())

@@ -208,10 +208,10 @@ def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | 
     stops = {view.number: view.stop for view in run.session.views}
     declared = chain_fit(run.robots[robot].base_from_flange, pair.poses, pair.mount)
     for other in (name for name in run.robots if name != robot):
-        there = run.robots[other].base_from_flange.items()
-        by_stop = {stops[view]: pose for view, pose in there}
+        other_poses = run.robots[other].base_from_flange.items()
+        by_stop = {stops[view]: pose for view, pose in other_poses}
         poses = {view: by_stop[stops[view]] for view in pair.poses if stops[view] in by_stop}
-        # One that waited, or turned about one axis, agrees with much.
+        # A robot that waited, or turned about one axis, agrees with much.
         turns = np.array([pose[:3, :3] for pose in poses.values()]).reshape(-1, 3, 3)
         if len(turns) < FEWEST_ROWS or is_about_one_axis(turns):
             continue
@@ -272,18 +272,18 @@ def _misread_poses(run: RunState, *, of_cell: bool = False) -> Iterator[Finding]
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are not those of the images, whatever the frames are."""
-    views, both = both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
-    kept, robot = thinned(np.arange(len(both))), both[:, 0]
-    views, both = views[kept], both[kept]
-    if len(both) < FEWEST_ROWS:
+    views, pairs = both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
+    kept, robot = thinned(np.arange(len(pairs))), pairs[:, 0]
+    views, pairs = views[kept], pairs[kept]
+    if len(pairs) < FEWEST_ROWS:
         return
-    # Both turn by the same angle between two views, whatever the unknown frames.
-    by_robot, by_camera = (relative_angles(both[:, side, :3, :3]) for side in (0, 1))
+    # Robot and camera turn by the same angle between two views, whatever the unknown frames.
+    by_robot, by_camera = (relative_angles(pairs[:, side, :3, :3]) for side in (0, 1))
     away = np.abs(by_robot - by_camera)
     if still := _still(robot):
         yield Finding("misread_poses", still, _LOG_ANEW)
     if np.quantile(away, PAIRS_SHARE) < _ALIKE_RAD:
-        yield from missing_axes(run, views, both)
+        yield from missing_axes(run, views, pairs)
     if np.median(away) > _ALIKE_RAD and (other := [*by_joints(run)]):
         yield from other
         return
@@ -291,11 +291,11 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     if np.median(away) > _ALIKE_RAD and (late := _on_the_way(robot, by_camera, kept)) is not None:
         yield late
         return
-    if np.median(away) > _ALIKE_RAD and (whose := _half_turned(both)):
+    if np.median(away) > _ALIKE_RAD and (whose := _half_turned(pairs)):
         yield Finding("misread_poses", f"The {whose}'s rotations {_HALF_TURNS}", _REAL_PART)
         return
     words = "The robot's poses are not those of the images: "
-    if np.ptp(both[:, 0, :3, 3], axis=0).max() < _STILL_M:
+    if np.ptp(pairs[:, 0, :3, 3], axis=0).max() < _STILL_M:
         words += "all rows have one position of the robot."
     elif np.quantile(away, PAIRS_SHARE) > _MISREAD_RAD and alike < _PAIRS_IN_PLACE:
         words += (
@@ -307,12 +307,12 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     yield Finding("misread_poses", words, UNRECORDED)
 
 
-def _half_turned(both: FloatArray) -> str:
+def _half_turned(pairs: FloatArray) -> str:
     """The side of (m, 2, 4, 4) poses all of whose rotations are half turns; empty for none.
 
-    Those of a tool that points straight down are, too, but about axes in one plane.
+    Rotations of a tool that points straight down are, too, but about axes in one plane.
     """
-    for whose, poses in zip(("robot", "target"), both.swapaxes(0, 1), strict=True):
+    for whose, poses in zip(("robot", "target"), pairs.swapaxes(0, 1), strict=True):
         turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
         spread = np.linalg.svd(turns, compute_uv=False)[-1] / np.sqrt(len(turns))
         if np.linalg.norm(turns, axis=1).min() > np.pi - _ALIKE_RAD and spread > 3 * _ALIKE_RAD:

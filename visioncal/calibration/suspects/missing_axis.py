@@ -26,7 +26,7 @@ _UNIT = 0.03
 _KNOWN = {"view", "stop", "stamp_s", *POSE, *MEASURED_CAM_POSE}
 
 
-def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[Finding]:
+def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[Finding]:
     """The finding that positions lack a motion along one line, which the camera saw.
 
     Rotations of robot and camera determine the rotation of X; places then are linear in the
@@ -35,16 +35,16 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
     Args:
         run: The run, of one robot and camera.
         views: (m,) numbers of the views that have both poses.
-        both: (m, 2, 4, 4) poses of the robot, and of the target by each image alone.
+        pairs: (m, 2, 4, 4) poses of the robot, and of the target by each image alone.
     """
     if run.mount is None or len(views) <= FEWEST_COMPARED:
         return
     # Without turns, positions alone leave a line open that no axis moved along.
-    if too_little_motion(both[:, 0], run.mount)[0]:
+    if too_little_motion(pairs[:, 0], run.mount)[0]:
         return
-    direction, motion, away_m, angles = _line(both, run.mount)
-    # Across it, no more is left than an arm errs by; along it, more moved than one thing once, or
-    # than a few views.
+    direction, motion, away_m, angles = _line(pairs, run.mount)
+    # Across the line, no more is left than an arm errs by; along it, more moved than one thing
+    # once, or than a few views.
     limits, moved_m = CalibrationLimits().arm_errors, float(np.ptp(motion))
     is_right = away_m < 1e-3 * limits[0] and np.quantile(angles, _MOST) < np.deg2rad(limits[1])
     many_m = np.quantile(np.abs(motion - np.median(motion)), _MOST)
@@ -65,7 +65,7 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
         if is_axis
         else "Write poses that contain this axis, or calibrate views at one place of it."
     )
-    if is_axis and _is_in_other_order(both[:, 0, axis, 3], motion, away_m):
+    if is_axis and _is_in_other_order(pairs[:, 0, axis, 3], motion, away_m):
         words = (
             f"The robot's {name} has the numbers of other rows, as where its column was sorted by "
             f"itself: in the order that the images show, robot and camera agree to "
@@ -122,14 +122,14 @@ def _left_by_step(motion: FloatArray) -> float:
     return float(np.sqrt(min(squares) / len(motion)))
 
 
-def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float, FloatArray]:
+def _line(pairs: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float, FloatArray]:
     """The line in the base with the least residuals across it.
 
     Returns:
-        Its direction (3,), the motion along it (m,) [m], the rms by axis across it [m], and how far
+        The direction (3,), the motion along it (m,) [m], the rms by axis across it [m], and how far
         the rotations are from agreeing (m,) [rad].
     """
-    flanges, camera = both[:, 0], both[:, 1]
+    flanges, camera = pairs[:, 0], pairs[:, 1]
     robot = robot_part(flanges, mount)
     (fit,) = robust_fits(robot[None], camera[None])
     by_edges, seen = distance_rows(robot, camera, fit.x)
@@ -138,7 +138,7 @@ def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float
         # In the axes of the base, in which a rail lies still.
         turned = -flanges[:, :3, :3]
         rows, places = turned @ rows, (turned @ places[..., None])[..., 0]
-    best = np.eye(3)[0], np.zeros(len(both)), np.inf
+    best = np.eye(3)[0], np.zeros(len(pairs)), np.inf
     for start in np.eye(3):
         direction = start
         for _ in range(_STEPS):

@@ -48,7 +48,7 @@ class Undoing:
 
 
 def copied_rows(
-    record: Record, edges: Edges, apart: FloatArray, own: IntArray, agrees: Mask
+    record: Record, edges: Edges, apart: FloatArray, paired: IntArray, agrees: Mask
 ) -> Iterator[Undoing]:
     """Poses of the robot, or of the target, that occur twice though the other one moved."""
     closes = apart[agrees].mean() < CLOSING_SCORE**2
@@ -72,7 +72,7 @@ def copied_rows(
         (record.copies, "the robot's pose", f"{digit}, though {log}", anew),
         seen,
     ):
-        copied = copies & ~agrees & (own >= 0)
+        copied = copies & ~agrees & (paired >= 0)
         if not copied.any() or not closes:
             continue
         # Where the robot stands still between views, equal poses say little.
@@ -106,19 +106,19 @@ def _shown_before(record: Record, edges: Edges, apart: FloatArray, agrees: Mask)
 
 
 def chosen_views(
-    own: IntArray, apart: FloatArray, other: FloatArray, base: float
+    paired: IntArray, apart: FloatArray, other: FloatArray, base: float
 ) -> tuple[float, Mask]:
     """Log odds that some views are otherwise, with other squares (m, 2), and the views (m,).
 
-    Any number of them is as likely, and any choice: they are those that it helps most.
+    Any number of views is as likely, and any choice: the change helps those most that are chosen.
     """
-    there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (other, apart))
-    order = np.argsort((there + LEAST**2) / (here + LEAST**2), kind="stable")
-    number = np.arange(1, len(own) + 1)
+    after, before = (np.where(paired < 0, 1.0, at.sum(axis=1)) for at in (other, apart))
+    order = np.argsort((after + LEAST**2) / (before + LEAST**2), kind="stable")
+    number = np.arange(1, len(paired) + 1)
     some = np.argsort(order) < number[:, None]
     squares = np.where(some[..., None], other, apart)
     logs, agrees = evidence(squares)
-    choices = gammaln(len(own) + 2) - gammaln(number + 1) - gammaln(len(own) - number + 1)
+    choices = gammaln(len(paired) + 2) - gammaln(number + 1) - gammaln(len(paired) - number + 1)
     odds = EVIDENCE * (logs - base) + MISTAKE - choices
     at = int(odds.argmax())
     closes = squares[at][agrees[at]].mean() < CLOSING_SCORE**2
@@ -126,14 +126,14 @@ def chosen_views(
 
 
 def other_signs(
-    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
+    record: Record, edges: Edges, paired: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Views whose position lost the sign of one axis."""
     for axis, name in enumerate("xyz"):
         flanges = robot_part(record.robot, record.mount).copy()
         flanges[:, axis, 3] *= -1.0
         signed = replace(record, robot=robot_part(flanges, record.mount))
-        odds, wrong = chosen_views(own, apart, replace(edges, record=signed).of(own), base)
+        odds, wrong = chosen_views(paired, apart, replace(edges, record=signed).of(paired), base)
         views = tuple(record.views[record.rows[wrong]].tolist())
         if not views:
             continue
@@ -152,7 +152,7 @@ def other_signs(
         )
 
 
-def mixed_unit_rows(record: Record, own: IntArray, base: float) -> Iterator[Undoing]:
+def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[Undoing]:
     """Views whose position is in millimetres where the others' are in metres, or the reverse.
 
     The sizes of the positions, or of one axis, tell the rows of either unit, however many they are.
@@ -167,10 +167,10 @@ def mixed_unit_rows(record: Record, own: IntArray, base: float) -> Iterator[Undo
     ):
         is_scaled = wrong[:, None] & np.array([name in part for name in "xyz"])
         scaled = compose(flanges[:, :3, :3], flanges[:, :3, 3] * np.where(is_scaled, factor, 1.0))
-        log = _of_changed(record, own, wrong, scaled)
+        log = _of_changed(record, paired, wrong, scaled)
         if log is None:
             continue
-        views = tuple(record.views[record.rows[wrong[own] & (own >= 0)]].tolist())
+        views = tuple(record.views[record.rows[wrong[paired] & (paired >= 0)]].tolist())
         whose = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
         short = f"{whose} is {unit} as in the others, as where it is in another unit"
         axes = ",".join(f"{factor:g}*{at}_m" if at in part else at for at in "xyz")
@@ -187,29 +187,29 @@ def mixed_unit_rows(record: Record, own: IntArray, base: float) -> Iterator[Undo
         )
 
 
-def _of_changed(record: Record, own: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
+def _of_changed(record: Record, paired: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
     """Log evidence of other poses of the robot in (n,) some rows; None where most disagree."""
-    rows = wrong[own] & (own >= 0)
-    if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
+    rows = wrong[paired] & (paired >= 0)
+    if np.sum(rows) < 1 or np.sum(~rows & (paired >= 0)) < 1:
         return None
-    edges = Edges.by(replace(record, robot=robot_part(flanges, record.mount)), own, own >= 0)
+    edges = Edges.by(replace(record, robot=robot_part(flanges, record.mount)), paired, paired >= 0)
     if edges is None:
         return None
-    squares = edges.of(own)
+    squares = edges.of(paired)
     (log,), (agrees,) = evidence(squares[None])
     is_close = squares[agrees].mean() < CLOSING_SCORE**2
     return float(log) if is_close and np.sum(agrees & rows) > 0.6 * np.sum(rows) else None
 
 
-def mixed_angle_rows(record: Record, own: IntArray, base: float) -> Iterator[Undoing]:
+def mixed_angle_rows(record: Record, paired: IntArray, base: float) -> Iterator[Undoing]:
     """Views whose angles are in radians where the others' are in degrees.
 
-    Read as degrees, they are of a robot that hardly turns.
+    Read as degrees, such angles are of a robot that hardly turns.
     """
     flanges = robot_part(record.robot, record.mount)
     angles = np.where(np.isfinite(flanges[:, 0, 0]), rotation_angle(flanges), np.inf)
     wrong = angles < np.deg2rad(np.pi * np.sqrt(3.0))
-    if not wrong.any() or wrong[own].all():
+    if not wrong.any() or wrong[paired].all():
         return
     turned = flanges.copy()
     for form in (
@@ -218,10 +218,10 @@ def mixed_angle_rows(record: Record, own: IntArray, base: float) -> Iterator[Und
     ):
         numbers = ROTATION_FORMS[f"{form.removesuffix('-rad')}-deg"].write(flanges[wrong, :3, :3])
         turned[wrong, :3, :3] = ROTATION_FORMS[form].read(numbers)
-        log = _of_changed(record, own, wrong, turned)
+        log = _of_changed(record, paired, wrong, turned)
         if log is None:
             continue
-        rows = wrong[own] & (own >= 0)
+        rows = wrong[paired] & (paired >= 0)
         views = tuple(record.views[record.rows[rows]].tolist())
         short = "the robot's angles are in radians, and were taken for degrees"
         words = (
@@ -244,11 +244,11 @@ def mixed_angle_rows(record: Record, own: IntArray, base: float) -> Iterator[Und
 
 
 def turned_rows(
-    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
+    record: Record, edges: Edges, paired: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Boards that were read as if they were turned in their plane, or some squares on in it."""
-    known = np.flatnonzero(own >= 0)
-    turned = edges.turned(own)
+    known = np.flatnonzero(paired >= 0)
+    turned = edges.turned(paired)
     for degrees in (180.0, 90.0, 270.0, 0.0):
         angle = np.deg2rad(degrees)
         turn = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
@@ -264,13 +264,13 @@ def turned_rows(
             continue
         squares = apart.copy()
         squares[near] = edges.squares(invert(whole) @ turned[near])
-        (there,), (agrees,) = evidence(squares[None])
+        (log,), (agrees,) = evidence(squares[None])
         wrong = near[agrees[near]]
         if not len(wrong) or squares[agrees].mean() > CLOSING_SCORE**2:
             continue
         # The middle is known by these views themselves, in two directions of their six.
         noise = float(np.sqrt(squares[agrees, 0].mean() / 3.0 + LEAST**2))
-        odds = EVIDENCE * (float(there - base) - 2.0 * float(np.log(2.0 / noise)))
+        odds = EVIDENCE * (float(log - base) - 2.0 * float(np.log(2.0 / noise)))
         odds += MISTAKE - float(np.log(4.0))
         views = tuple(record.views[record.rows[wrong]].tolist())
         centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) if degrees else middle
@@ -376,8 +376,8 @@ def rows_apart(
     when, left = ("In all views", "") if side.all() else (when, " They were left out.")
     # A pose is of one image.
     partners = range(record.rows[side][0], record.rows[side][-1] + 1)
-    both = zip(views, pairs[by][side].tolist(), strict=True)
-    lost = [str(view) for view, pair in both if pair not in partners]
+    view_pairs = zip(views, pairs[by][side].tolist(), strict=True)
+    lost = [str(view) for view, pair in view_pairs if pair not in partners]
     dropped = f" No row is left for view {some_of(lost)}." if lost else ""
     yield Undoing(
         EVIDENCE * (log - base) + MISTAKE - float(np.log(2.0 * count * len(SHIFTS))),
@@ -392,22 +392,22 @@ def rows_apart(
     )
 
 
-def _apart_amid(record: Record, own: FloatArray, other: FloatArray, by: int) -> Mask:
+def _apart_amid(record: Record, stated: FloatArray, other: FloatArray, by: int) -> Mask:
     """(2, m) the run of views that other poses explain best, and with those whose pose these have.
 
     Args:
         record: The record.
-        own: (m, 2) squares by the poses of their own rows.
+        stated: (m, 2) squares by the poses of the views' rows.
         other: The same by those of the rows apart.
         by: By how many rows.
     """
-    here, there = (np.where(np.isfinite(at), at, 1.0).sum(axis=1) for at in (own, other))
-    gains = np.log((here + LEAST**2) / (there + LEAST**2))
-    # A view that neither explains ends the run.
+    before, after = (np.where(np.isfinite(at), at, 1.0).sum(axis=1) for at in (stated, other))
+    gains = np.log((before + LEAST**2) / (after + LEAST**2))
+    # A view that neither pose explains ends the run.
     sums = np.append(0.0, np.cumsum(np.clip(gains, *_CLIPPED) - 1.0))
     last = int(np.argmax(sums - np.minimum.accumulate(sums)))
     rows = record.rows[int(np.argmin(sums[: last + 1])) : last]
     if not len(rows):
-        return np.zeros((2, len(own)), dtype=bool)
+        return np.zeros((2, len(stated)), dtype=bool)
     first, last = rows[0] + np.array([[0], [min(by, 0)]]), rows[-1] + np.array([[0], [max(by, 0)]])
     return np.asarray((record.rows >= first) & (record.rows <= last))

@@ -27,9 +27,9 @@ _CLEAR = 30.0
 
 def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     """The finding that another direction of gravity explains what bends an arm, if one does."""
-    own, fit = arm.kinematics, run.cell_fit.fit
+    kinematics, fit = arm.kinematics, run.cell_fit.fit
     documents = {robot_key(name): at for name, at in run.session.robot_documents.items()}
-    if own is None or arm.matched is None or arm.robot not in documents:
+    if kinematics is None or arm.matched is None or arm.robot not in documents:
         return None
     known, declared = arm.matched.robot, Robot.from_document(documents[arm.robot])
     noise_rad, noise_m = fit.noise.robots[fit.robots.index(arm.robot)].tolist()
@@ -50,8 +50,8 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     if not tried:
         return None
     level, axis = max(tried, key=lambda pair: pair[0].fit.gain)
-    gain = level.fit.gain - own.fit.gain
-    before_mm, after_mm = (at.fit.result.held_out_mm for at in (own, level))
+    gain = level.fit.gain - kinematics.fit.gain
+    before_mm, after_mm = (at.fit.result.held_out_mm for at in (kinematics, level))
     if gain < _CLEAR or CLEAR_RATIO * after_mm > before_mm:
         return None
     line = f"gravity_m_s2 = {gravity_words(axis)}"

@@ -56,7 +56,7 @@ def _exchanged(
     before = [edges[move.before].matrix for move in pair]
     between_mm = pose_difference(*before)[0]
     now = after(first), after(second)
-    away = [pose_difference(*both)[0] for both in zip(now, before[::-1], strict=True)]
+    away = [pose_difference(*ends)[0] for ends in zip(now, before[::-1], strict=True)]
     if max(away) > _EXCHANGED * between_mm:
         return None
     names = [object_name(move.frame, "camera") for move in pair]

@@ -347,9 +347,9 @@ def _common_change(
     are_places = not part.observations.has_rotation.all()
     if are_places and len(part) < FEWEST_STOPS:
         most = 1.0 / CLEAR_RATIO**2
-    both = part.measured(state), part.predicted(state)
-    turned = float(np.median(rotation_angle(invert(both[0]) @ both[1])))
-    measured, predicted = (poses[:, :3, 3] for poses in both)
+    sides = part.measured(state), part.predicted(state)
+    turned = float(np.median(rotation_angle(invert(sides[0]) @ sides[1])))
+    measured, predicted = (poses[:, :3, 3] for poses in sides)
     sizes = np.sum(measured * (predicted - measured), axis=1) / np.sum(measured**2, axis=1)
     of_size = float(np.ptp(sizes) / max(abs(np.median(sizes)), np.finfo(float).tiny))
     found = list[tuple[float, str, FloatArray]]()

@@ -23,10 +23,10 @@ _PARTS = "xyzR"
 _NAMES = dict(zip(_PARTS, ("x_m", "y_m", "z_m", "qx to qw"), strict=True))
 
 
-def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
+def of_other_rows(run: RunState, rival_score: float) -> Iterator[Finding]:
     """The finding that some columns close the chain with the numbers of rows before or after.
 
-    It does so clearly better than another reading, whose score is `beside`.
+    Such numbers close it clearly better than another reading does, whose score is `rival_score`.
     """
     if run.mount is None or run.mount == "instrument":
         return
@@ -44,12 +44,12 @@ def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
         order = shifted(by, len(views))
         moved = np.array([_moved(flanges, parts, order)[rows] for parts in choices])
         # A row has no other one, whichever of its columns are moved.
-        there = np.isfinite(moved).all(axis=(0, 2, 3))
-        if there.sum() > FEWEST_ROWS:
-            robot = robot_part(moved[:, there], run.mount or "eye-in-hand")
-            fits = robust_fits(robot, np.broadcast_to(camera[there], robot.shape), STARTS)
+        is_complete = np.isfinite(moved).all(axis=(0, 2, 3))
+        if is_complete.sum() > FEWEST_ROWS:
+            robot = robot_part(moved[:, is_complete], run.mount or "eye-in-hand")
+            fits = robust_fits(robot, np.broadcast_to(camera[is_complete], robot.shape), STARTS)
             for fit, parts in zip(fits, choices, strict=True):
-                yield replace(fit, lost=int(np.sum(~there))), parts, by
+                yield replace(fit, lost=int(np.sum(~is_complete))), parts, by
 
     choices = ["".join(some) for size in (1, 2, 3) for some in combinations(_PARTS, size)]
     found = [each for by in _SHIFTS for each in fitted(choices, by)]
@@ -64,7 +64,7 @@ def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
     # leave it, and no nearer in what was moved.
     sides = [side for side, some in enumerate(("xyz", "R")) if {*some} & {*parts}]
     is_nearer = all(CLEAR_RATIO * best.rms[side] < first.rms[side] for side in sides)
-    is_clear = best.closes and odds >= 2.0 * CLEAR and CLEAR_RATIO * best.score <= beside
+    is_clear = best.closes and odds >= 2.0 * CLEAR and CLEAR_RATIO * best.score <= rival_score
     if not is_clear or not is_nearer:
         return
     names, apart = listed([_NAMES[part] for part in parts]), counted(abs(by), "row")

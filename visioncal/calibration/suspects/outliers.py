@@ -139,9 +139,9 @@ def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     found = other_names(inliers.problem, inliers.fit, outliers, inliers.moves)
     by_names = defaultdict[tuple[str, str], list[int]](list)
     for at, names in found.items():
-        own = rows[at].seer, rows[at].seen
-        side = int(own[0].partition("@")[0] == names[0])
-        by_names[own[side].partition("@")[0], names[side]].append(at)
+        frames = rows[at].seer, rows[at].seen
+        side = int(frames[0].partition("@")[0] == names[0])
+        by_names[frames[side].partition("@")[0], names[side]].append(at)
     several = {names: some for names, some in by_names.items() if len(some) >= _FEWEST_MISNAMED}
     if not several:
         return
@@ -251,7 +251,7 @@ def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:
 
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, str], frozenset[int]]:
     """Why outliers are left out, by view, given the likely cause of each; and the marginal ones."""
-    inliers, alone = cell_fit.inlier_fit, cell_fit.cell.mount is not None
+    inliers, is_single = cell_fit.inlier_fit, cell_fit.cell.mount is not None
     directions = np.maximum(inliers.distances.directions, 1)
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)
@@ -270,7 +270,7 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, st
         beyond = "many times as far as most"
         if distance[at] > limit[at]:
             beyond = f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
-        target = f"the {row.seen.partition('_')[0]}" if alone else row.seen.partition("@")[0]
+        target = f"the {row.seen.partition('_')[0]}" if is_single else row.seen.partition("@")[0]
         if may_err and distance[at] < _MARGIN * limit[at]:
             marginal.add(row.view)
         reasons[row.view] = (
@@ -293,12 +293,12 @@ def _cause(
     """Likely cause of an outlier, by stops that it fits and by inliers of its stop and target."""
     rows, stops = cell_fit.cell.rows, cell_fit.cell.stops
     for circle in (some for some in circles if at in some):
-        own, other = rows[at], rows[circle[(circle.index(at) + 1) % len(circle)]]
+        row, other = rows[at], rows[circle[(circle.index(at) + 1) % len(circle)]]
         if len(circle) > 2:
             return f"it fits stop {stops[other.station]}, of view {other.view}"
         return (
             f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
-            f"{stops[own.station]}: these two rows are exchanged"
+            f"{stops[row.station]}: these two rows are exchanged"
         )
     cause, problem = _WRONG, cell_fit.inlier_fit.problem
     of_stop = problem.observations.stops

@@ -99,12 +99,12 @@ def pairs_alone(run: RunState, calibrated: PairRun) -> list[PairAlone]:
     for at, (robot, pair) in enumerate(every[:_MOST_PAIRS] if len(every) > 1 else ()):
         if run.progress is not None:
             run.progress("pairs", at, min(len(every), _MOST_PAIRS))
-        alone = of_pair(run, robot, pair)
+        pair_run = of_pair(run, robot, pair)
         corners = {
-            view: seen for look in alone.cameras.values() for view, seen in look.corners.items()
+            view: seen for look in pair_run.cameras.values() for view, seen in look.corners.items()
         }
         try:
-            answer = calibrated(alone.session, corners)
+            answer = calibrated(pair_run.session, corners)
         except (VisioncalError, ValueError, ArithmeticError):
             # Another pair may show why, and the cell's own answer stands; singular matrices, too.
             continue
@@ -251,19 +251,19 @@ def _contradiction(
 ) -> Finding:
     """The finding that two pairs agree by themselves, and place a frame otherwise."""
     views = tuple(sorted(other.pair.poses))
-    both = f"{one.words} agree by themselves, and so do {other.words}"
+    agreement = f"{one.words} agree by themselves, and so do {other.words}"
     boards = {at: run.session.boards[name] for name, at in run.session.board_frames.items()}
     board = boards.get(frame)
     if board is not None and _is_half_turn(board, step):
         words = (
             f"{other.pair.camera} numbers the corners of {frame} from the other end, turned by 180 "
-            f"deg in its plane, than {one.pair.camera}: {both}."
+            f"deg in its plane, than {one.pair.camera}: {agreement}."
         )
         return Finding(PAIRS_APART.kind, words, turned_back(board, views), views)
     others = [view.number for view in run.session.views if view.number not in other.pair.poses]
     moved = "it was moved" if board is not None else "the board was another one"
     words = (
-        f"{both}, but place {frame} {mm_and_deg(*_apart(step))} apart: between their views, "
+        f"{agreement}, but place {frame} {mm_and_deg(*_apart(step))} apart: between their views, "
         f"{moved}, or the rows of one have another lens, board or robot than is stated."
     )
     do = or_alone(

@@ -86,9 +86,9 @@ class Record:
             if pose is not None:
                 robot[at] = pose
             if view in seen and view in every and view not in excluded:
-                own = turns.get(session.board_of(every[view]), np.eye(4)[None])
+                board_turns = turns.get(session.board_of(every[view]), np.eye(4)[None])
                 rows.append(at)
-                camera.append((seen[view].cam_from_target[:, None] @ own).reshape(-1, 4, 4))
+                camera.append((seen[view].cam_from_target[:, None] @ board_turns).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
         mount: Mount = run.mount or "eye-in-hand"

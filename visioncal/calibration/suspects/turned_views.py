@@ -27,7 +27,7 @@ def _found(run: RunState) -> Iterator[Finding]:
         read = invert(symmetries[turn]) @ symmetries[usual]
         degrees = float(np.rad2deg(np.arctan2(read[1, 0], read[0, 0])))
         centre = 1e3 * np.linalg.solve(np.eye(2) - read[:2, :2], read[:2, 3])
-        views = tuple(view for view, own in turns.items() if own == turn)
+        views = tuple(view for view, at in turns.items() if at == turn)
         about = ",".join(f"{value:g}" for value in np.round([degrees, *centre], 2).tolist())
         yield Finding(
             "turned_views",

@@ -75,12 +75,12 @@ def likeliest(run: RunState, stops: Mapping[int, StopOfRobot] | None = None) -> 
     record = Record.of(run, stops)
     if len(record.rows) < FEWEST_COMPARED:
         return None
-    own = record.paired(np.arange(len(record.views)))
+    paired = record.paired(np.arange(len(record.views)))
     fresh = ~record.copies & ~record.lingering
-    declared = Edges.by(record, own, fresh)
+    declared = Edges.by(record, paired, fresh)
     if declared is None:
         return None
-    squares = declared.of(own)
+    squares = declared.of(paired)
     agrees = evidence(squares[None])[1]
     # Turns that agree do not let a few places that are off count as wrong.
     is_even = (squares < UNEVEN**2 * (np.median(squares, axis=0) + LEAST**2)).all()
@@ -91,30 +91,30 @@ def likeliest(run: RunState, stops: Mapping[int, StopOfRobot] | None = None) -> 
     every = [declared]
     every += filter(None, (Edges.by(record, pairs[by], fresh) for by in shifts[1:]))
     # Two losses may leave no half of all rows right, and yet most of one end's.
-    halves = np.arange(len(own)) < 0.5 * len(own)
-    every += filter(None, (Edges.by(record, own, fresh & half) for half in (halves, ~halves)))
-    best = max(every, key=lambda edges: float(evidence(edges.of(own)[None])[0][0]))
-    apart = best.of(own)
+    halves = np.arange(len(paired)) < 0.5 * len(paired)
+    every += filter(None, (Edges.by(record, paired, fresh & half) for half in (halves, ~halves)))
+    best = max(every, key=lambda edges: float(evidence(edges.of(paired)[None])[0][0]))
+    apart = best.of(paired)
     (base,), (agrees,) = evidence(apart[None])
-    rivals = [*copied_rows(record, best, apart, own, agrees)]
+    rivals = [*copied_rows(record, best, apart, paired, agrees)]
     if len(record.views) >= len(run.session.views):
         # Shifted are all rows, of one point as of others.
         rivals += rows_apart(record, every, pairs, float(base))
     if record.shows == "image":
         rivals += [
-            *_flipped(record, best, own, apart, float(base)),
-            *_turned_pictures(run, record, best, own, apart, float(base)),
-            *other_signs(record, best, own, apart, float(base)),
-            *mixed_unit_rows(record, own, float(base)),
-            *mixed_angle_rows(record, own, float(base)),
-            *turned_rows(record, best, own, apart, float(base)),
+            *_flipped(record, best, paired, apart, float(base)),
+            *_turned_pictures(run, record, best, paired, apart, float(base)),
+            *other_signs(record, best, paired, apart, float(base)),
+            *mixed_unit_rows(record, paired, float(base)),
+            *mixed_angle_rows(record, paired, float(base)),
+            *turned_rows(record, best, paired, apart, float(base)),
         ]
     found = max(rivals, key=lambda rival: rival.odds, default=None)
     return found if found is not None and found.odds > CLEAR else None
 
 
 def _flipped(
-    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
+    record: Record, edges: Edges, paired: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Views of a flat board with the other one of the two poses that its image nearly fits.
 
@@ -124,22 +124,22 @@ def _flipped(
     sight = seen[..., :3, 3:] / np.linalg.norm(seen[..., :3, 3:], axis=-2, keepdims=True)
     mirror = np.eye(3) - 2.0 * sight @ np.swapaxes(sight, -1, -2)
     other = compose(mirror @ seen[..., :3, :3] @ np.diag([1.0, 1.0, -1.0]), seen[..., :3, 3])
-    mirrored = replace(edges, record=replace(record, camera=other)).of(own)
-    odds, wrong = chosen_views(own, apart, mirrored, base)
-    for at in range(len(own)) if len(own) <= FEW_VIEWS else ():
+    mirrored = replace(edges, record=replace(record, camera=other)).of(paired)
+    odds, wrong = chosen_views(paired, apart, mirrored, base)
+    for at in range(len(paired)) if len(paired) <= FEW_VIEWS else ():
         # One view in a few bends the fit.
         camera = record.camera.copy()
         camera[at] = other[at]
-        alone = Edges.by(replace(record, camera=camera), own, own >= 0)
-        if alone is not None:
-            squares = alone.of(own)
+        single = Edges.by(replace(record, camera=camera), paired, paired >= 0)
+        if single is not None:
+            squares = single.of(paired)
             (log,), (agrees,) = evidence(squares[None])
-            gain = EVIDENCE * float(log - base) + MISTAKE - float(np.log(len(own)))
+            gain = EVIDENCE * float(log - base) + MISTAKE - float(np.log(len(paired)))
             if gain > odds and squares[agrees].mean() < CLOSING_SCORE**2:
-                odds, wrong = gain, np.arange(len(own)) == at
+                odds, wrong = gain, np.arange(len(paired)) == at
     # Wrong poses that a mirror brings so near by chance: the turns left have three directions.
     nearly = (apart[:, 0] < _NEARLY**2 * apart[:, 1]) & (mirrored[:, 1] < _NEARLY**2 * apart[:, 1])
-    nearly &= ~evidence(apart[None])[1][0] & (own >= 0)
+    nearly &= ~evidence(apart[None])[1][0] & (paired >= 0)
     gain = MISTAKE + 1.5 * float(np.log(apart[nearly, 1] / (mirrored[nearly, 1] + LEAST**2)).sum())
     if gain > CLEAR > odds:
         odds, wrong = gain, nearly
@@ -166,19 +166,19 @@ def _flipped(
 
 
 def _turned_pictures(
-    run: RunState, record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
+    run: RunState, record: Record, edges: Edges, paired: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Views whose picture is turned: the camera is, about the line of sight."""
     for degrees in (180, 90, 270):
         turn = exp(np.array([0.0, 0.0, np.deg2rad(degrees), 0.0, 0.0, 0.0]))
         turned = replace(edges, record=replace(record, camera=invert(turn) @ record.camera))
         if record.is_numbered:
-            wrong = (own >= 0) & (turned.of(own)[:, 1] < NEAR_TURN_RAD**2)
-            wrong &= turned.of(own)[:, 1] < apart[:, 1]
-            odds = _by_pixels(run, record, own, wrong, degrees // 90, base)
+            wrong = (paired >= 0) & (turned.of(paired)[:, 1] < NEAR_TURN_RAD**2)
+            wrong &= turned.of(paired)[:, 1] < apart[:, 1]
+            odds = _by_pixels(run, record, paired, wrong, degrees // 90, base)
         else:
-            squares = turned.of(own)
-            odds, wrong = chosen_views(own, apart, squares, base)
+            squares = turned.of(paired)
+            odds, wrong = chosen_views(paired, apart, squares, base)
             # A picture turns about the lens: by more than others scatter, the camera was moved.
             usual = max(9.0 * float(np.median(apart[:, 0])), (_IN_PLACE_M / edges.lever) ** 2)
             if not wrong.any() or np.median(squares[wrong, 0]) > usual:
@@ -205,14 +205,15 @@ def _turned_pictures(
 
 
 def _by_pixels(
-    run: RunState, record: Record, own: IntArray, wrong: Mask, quarters: int, base: float
+    run: RunState, record: Record, paired: IntArray, wrong: Mask, quarters: int, base: float
 ) -> float:
     """Log odds that (m,) some views' pictures are turned: with these turned back, and a lens anew.
 
-    As poses alone they would not agree: a lens's centre is off the middle of the pictures.
+    Turned back as poses alone, views would not agree: a lens's centre is off the middle of the
+    pictures.
     """
     views = {*record.views[record.rows[wrong]].tolist()}
-    if not views or len(views) == len(own):
+    if not views or len(views) == len(paired):
         return -np.inf
     for frame, look in run.cameras.items():
         if look.resolution is None:
@@ -230,7 +231,7 @@ def _by_pixels(
     mended = Record.of(run)
     pairs = mended.paired(np.arange(len(mended.views)))
     fitted = Edges.by(mended, pairs, ~mended.copies & ~mended.lingering)
-    if fitted is None or len(pairs) < len(own):
+    if fitted is None or len(pairs) < len(paired):
         return -np.inf
     squares = fitted.of(pairs)
     (log,), (agrees,) = evidence(squares[None])
