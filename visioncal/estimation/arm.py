@@ -37,7 +37,7 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
     and calibrated ones).
 
     Args:
-        likelihood: That of the robots' noise levels without these errors, at the solution.
+        likelihood: Of the robots' noise levels without these errors, at the solution.
         robot: Index of the robot.
         basis: (s, 6, p) of `link_basis`, by stop.
     """

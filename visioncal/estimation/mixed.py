@@ -199,7 +199,8 @@ class MixedModel:
         posterior = np.sum(root[is_random] ** 2, axis=1) + values[is_random] ** 2
         by_size += (1.0 / random_variances - posterior / random_variances**2) @ parts
         # Working variates: derivatives of the covariance by the logarithm of each size, times the
-        # weighted residuals. Their products, less what the unknowns absorb, are the information.
+        # weighted residuals. The variates' products, less what the unknowns absorb, are the
+        # information.
         along = np.zeros((len(values), len(variances)))
         along[is_random] = 2.0 * parts * (values[is_random] / random_variances)[:, None]
         back = np.swapaxes(at.whitening, 1, 2)

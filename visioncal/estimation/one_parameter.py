@@ -45,7 +45,7 @@ def far_parameters(
 ) -> list[FarParameter]:
     """The parameters that explain an arm's errors alone, likeliest first; empty where none does.
 
-    Those that the stops do not distinguish from the first within a factor of 20 follow it.
+    Parameters that the stops do not distinguish from the first within a factor of 20 follow it.
 
     Args:
         arm: The observations of the arm, with its errors.

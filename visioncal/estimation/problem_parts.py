@@ -300,7 +300,7 @@ def units_of(
 ) -> tuple[IntArray, IntArray]:
     """Unit (n,) of each observation at a stop (n,), those that share errors of flanges there.
 
-    It is -1 for none. And (u, w) the indices of each unit's robots, padded with -1.
+    The unit is -1 for none. And (u, w) the indices of each unit's robots, padded with -1.
     """
     count, joined = len(robots), []
     first = np.full(len(stops), -1, dtype=np.int64)

@@ -123,7 +123,8 @@ class RobotLikelihood:
     ) -> Self:
         """Appends k unknowns that move a robot's flange.
 
-        They affect the units' flange error estimates only, in which the errors are eliminated.
+        The unknowns affect the units' flange error estimates only, in which the errors are
+        eliminated.
 
         Args:
             robot: Index of the robot.

@@ -161,8 +161,8 @@ def find_steps(
 
     Args:
         problem: The inlier observations.
-        fit: Their converged fit.
-        candidates: What may have changed.
+        fit: The converged fit of the problem.
+        candidates: Frames, joints or others that may have changed.
         kinds: Number of kinds of residuals, rotations and positions, if a frame's step may be in
             one alone: it then has to explain a half as much, and noise explains it more often. No
             `evidence` follows for a drift, whose test is of both.
@@ -304,7 +304,7 @@ def twice(
 
     Args:
         problem: The inlier observations.
-        fit: Their converged fit.
+        fit: The converged fit of the problem.
         step: A step of a frame.
         stepped: The problem with it, and its fit.
 

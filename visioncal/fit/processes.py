@@ -336,7 +336,7 @@ def _combined(
     unknowns of lenses are a few hundreds. Where there are less unknowns, they stay as they are.
 
     Returns:
-        Both, and the (r, b) sizes of boards that are held by these combinations.
+        Rows and rest, and the (r, b) sizes of boards that are held by these combinations.
     """
     p, rest, flat = errors.count, errors.rest, errors.rows[some].reshape(-1, errors.rows.shape[2])
     if p <= len(flat):

@@ -233,10 +233,10 @@ class Unknowns:
 def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool) -> Vector | None:
     """A stated lens, as far as it may be off; None where no sigma is known.
 
-    Its focal lengths and centre are off by the stated sigma, if there is one. Where `is_spare`, (n,
-    2) corners determine the rest: by a maker's prior if it is to be refined, else by a
-    size of focal lengths, centre and distortion each. In units of intrinsics that move the corners
-    by one pixel (rms), but where these are stated.
+    Focal lengths and centre are off by the stated sigma, if there is one. Where `is_spare`, (n, 2)
+    corners determine the rest: by a maker's prior if the lens is to be refined, else by a size of
+    focal lengths, centre and distortion each. In units of intrinsics that move the corners by one
+    pixel (rms), but where these are stated.
     """
     lens, stated = table.stated, table.matrix_sigma_px
     if lens is None:

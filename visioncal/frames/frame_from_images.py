@@ -67,7 +67,7 @@ def seen_frame(
     Args:
         session: The images, of the same camera; its target is the one on the tool or the fixture.
         calibration: The camera's.
-        kind: What the target is on.
+        kind: The frame that the target is on.
         point_target_m: (3,) the frame's origin in the target's frame [m], such as the tool's tip;
             its axes are the target's.
         options: Limits of the verdict.

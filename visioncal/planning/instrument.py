@@ -127,7 +127,7 @@ def plan_for_instrument(
 
     Args:
         cell: The cell, by rough guesses.
-        purpose: Which errors of the arm are unknown.
+        purpose: The errors of the arm that are unknown.
         count: Number of stops.
         criterion: See `choose_stops`.
         possible: Number of candidates.

@@ -123,7 +123,7 @@ def left_candidates(
         q: (k, n) joint angles of all candidates [rad].
         left: Rows of the candidates.
         chosen: (s,) rows of the stops.
-        route: Its path.
+        route: The path through the stops.
         missed_only: Whether only the missed stops go. Otherwise all nearer to these than to reached
             ones go, too, since another in the same part of the workspace would replace each.
     """

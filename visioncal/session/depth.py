@@ -37,7 +37,7 @@ def read_depth(
 
     Args:
         data: Bytes of the file.
-        path: Its name, whose ending says what it is.
+        path: Name of the file, whose ending says its format.
         size: (width, height) of the image [px].
         unit_m: Unit of a picture [m]; where None, millimetres of integers and metres of others.
 
@@ -123,7 +123,7 @@ def read_cloud(data: bytes, path: str) -> FloatArray:
 
     Args:
         data: Bytes of the file.
-        path: Its name.
+        path: Name of the file.
 
     Returns:
         (h, w, 3) of an organised cloud that says so, else (n, 3) [m].

@@ -311,7 +311,7 @@ def _document(session: SessionContent, chosen: Chosen) -> dict[str, Any]:
 def is_whole_cell(session: SessionContent) -> bool:
     """Whether a session can only be calibrated as a whole cell.
 
-    This includes a camera with an instrument, where the session has `[frames]`.
+    A camera with an instrument is one, where the session has `[frames]`.
     """
     has_both_kinds = bool(session.cameras and session.instruments)
     return bool(_whole_cell_words(session)) or (has_both_kinds and bool(session.declaration.frames))

@@ -145,7 +145,7 @@ def check_two_sides(name: str, views: Sequence[View], next_step: str) -> None:
 
     Args:
         name: Name of the session, for the message.
-        views: Its rows.
+        views: Rows of the session.
         next_step: The remedy.
 
     Raises:

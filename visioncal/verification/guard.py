@@ -135,7 +135,7 @@ class Guard:
             calibration: The calibration, or the path of its folder or calibration.json.
             false_alarm_looks: Mean number of looks from one false alarm to the next.
             slow_mm: Standard deviation of motions that are no fault, over hours, of camera and
-                board, each per axis [mm]; 2 mrad a millimetre of rotation. It is learned.
+                board, each per axis [mm]; 2 mrad a millimetre of rotation. The value is learned.
             camera: The camera's name, where the calibration is of a whole cell.
             robot: The robot's name, likewise.
             target: The target's name, likewise.

@@ -96,7 +96,7 @@ def recover(
     Args:
         session: The stops.
         old: The calibration before the change.
-        causes: What changed: see `changed`; empty for a calibration by the new stops alone.
+        causes: Parts that changed: see `changed`; empty for a calibration by the new stops alone.
         check: The check of the first part of `parted`, where `causes` are given.
 
     Returns:
@@ -149,8 +149,8 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
 
     Args:
         check: The check of the stops.
-        causes: What changed: `camera`, `board` (with its name, of several), `joint 3`; `base` or
-            `mount` where the fixed board or camera, or what the flange carries, moved with
+        causes: Parts that changed: `camera`, `board` (with its name, of several), `joint 3`; `base`
+            or `mount` where the fixed board or camera, or what the flange carries, moved with
             everything on its side of the arm.
         off: Residuals of stops that are held back.
 
@@ -164,7 +164,7 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
     possible = {at.name: at.cause for at in check.compared if at.cause.kind in _RECOVERABLE}
     names = parts_changed(old, causes, possible)
     joints = [name for name in names if name.startswith(JOINT)]
-    # Those of edges first.
+    # Causes of edges come first.
     chosen = sorted((possible[name] for name in names), key=lambda cause: cause.kind == JOINT)
     moved = [0 if at.kind == CAMERA else 1 + at.at for at in chosen if at.kind != JOINT]
     problem, belief, found, offset = _estimated(check, chosen, moved)
@@ -198,7 +198,7 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
         boards=tuple(check.predicted.boards.tolist()),
         poses=log(problem.poses[ROBOT][problem.observations.stops]),
         residuals=np.round(residuals, 9),
-        # It is safe to suppose that nothing of it repeats itself.
+        # All of the covariance counts as noise: the safe assumption is that none repeats itself.
         by_noise=covariance,
     )
     new = replace(
@@ -216,7 +216,7 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
         views=tuple(views.values()),
         rms=rms,
         validation=Validation("stops that were held back", off),
-        # These are of the old stops.
+        # The solvers' results are of the old stops.
         solvers={},
         need=None,
         touch_test=None,

@@ -57,7 +57,7 @@ def scene_moves(
 
     Args:
         episodes: All that the camera saw, in the order of time.
-        camera: Its intrinsics.
+        camera: The camera's intrinsics.
         mask: (h, w) pixels that stand still; None for all.
         looks: Frames an episode that are compared; a move is named by its frame all the same.
         steady_px: Sigma of the image's harmless motion from look to look [px].

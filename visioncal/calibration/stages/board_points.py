@@ -288,7 +288,7 @@ def _reduced(
     """Derivatives (n, 2, c) by corners' places, and residuals, beside all that is smooth.
 
     Returns:
-        Both, and how many unknowns beside the poses were eliminated.
+        Derivatives and residuals, and the number of eliminated unknowns beside the poses.
     """
     columns = columns.copy()
     stack.weigh(columns)

@@ -150,8 +150,8 @@ def select_errors(
 ) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
 
-    Their sizes are estimated together; see `arm_sizes`. They must also predict left-out stops
-    better than the nominal arm.
+    The errors' sizes are estimated together; see `arm_sizes`. An arm with such errors must also
+    predict left-out stops better than the nominal arm.
 
     Args:
         problem: The observations, without errors of this arm.

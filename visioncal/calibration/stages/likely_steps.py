@@ -91,12 +91,12 @@ def likely_steps(
 ) -> tuple[Step, ...]:
     """The likeliest step that the residuals show, followed by others about as likely; or a drift.
 
-    Of a frame that was moved twice it is the later one, with the earlier. Its gain is the
-    logarithm, doubled, of its Bayes factor beside the errors of arms.
+    Of a frame that was moved twice it is the later one, with the earlier. A step's gain is
+    the logarithm, doubled, of its Bayes factor beside the errors of arms.
 
     Args:
         problem: The inlier observations, with stops in the order of the session.
-        fit: Their converged fit.
+        fit: The converged fit of the problem.
         errors: Errors of arms whose joints are not known, by robot.
         offsets: (s, 6, n) Jacobian of the flange by joint offsets, for the other robots.
     """

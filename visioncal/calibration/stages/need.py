@@ -324,7 +324,7 @@ def _uncorrected(
 
     Args:
         picks: Picks at n sightings.
-        fitted: Their fit.
+        fitted: The fit of the sightings.
         stops: (n,) the sightings' stops.
         in_base: (n, 4, 4) `base_from_target`.
         at_m: (n, 3) the positions, in the targets' frames where `whole`, else in the base [m].
@@ -340,7 +340,7 @@ def _uncorrected(
     offsets[:, 3:] -= np.cross(at_m, offsets[:, :3])
     if not is_carried or len(offsets) < 2:
         return replace(picks, offsets=offsets)
-    # It looks in the posture of one view, and picks in that of another.
+    # A robot looks in the posture of one view, and picks in that of another.
     looks, after = np.arange(len(offsets)), np.arange(1, len(offsets))
     after = after[:: -(-len(looks) * len(after) // _MOST_PAIRS)]
     goes = ((looks + after[:, None]) % len(looks)).ravel()

@@ -128,7 +128,7 @@ def _columns(
 ) -> tuple[FloatArray, FloatArray]:
     """(s, 6, c) columns of stops, largest remainder first, and (2,) the variance they leave.
 
-    They are those of processes of a squared size each.
+    The columns are of processes, weighed by a squared size each.
     """
     all_stops, columns = np.arange(count), np.zeros((count, 6, 0))
     remainder = np.zeros((count, 6, 6))

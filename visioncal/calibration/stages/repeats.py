@@ -83,8 +83,8 @@ def without_repeats(seen: T) -> T:
 def with_stop_means(seen: T) -> T:
     """Takes the mean of the corners of many images of a board at one stop of a camera.
 
-    They share the errors of arm, lens and print, and differ by noise alone. The first view stands
-    for all: a film of twelve stops is calibrated as twelve views.
+    Images of one stop share the errors of arm, lens and print, and differ by noise alone. The first
+    view stands for all: a film of twelve stops is calibrated as twelve views.
     """
     groups = defaultdict(list)
     try:

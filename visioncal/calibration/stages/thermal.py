@@ -217,9 +217,9 @@ def find_drift(
         problem: The observations, with the arm as reported.
         start: Starting values.
         robot: The robot in the problem.
-        stops: Its stops there, ascending.
-        inputs: What heats the arm.
-        nominal: Its model.
+        stops: The robot's stops in the problem, ascending.
+        inputs: Heat sources of the arm.
+        nominal: The robot's model.
     """
     poses = problem.poses[robot]
     robot_stops = np.isin(

@@ -92,7 +92,7 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
             do = mending("all of them are in m", f"--positions {every}:{','.join(mended)}")
             yield Finding("misread_poses", words, do)
             return
-    # Those that no stage reads.
+    # Columns that no stage reads.
     columns = [column for column in run.session.columns if column not in _KNOWN]
     for column, factor in _columns(run, by_view, away_m, columns):
         if not (unit := _unit_of(abs(factor))):

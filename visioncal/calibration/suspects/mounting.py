@@ -34,7 +34,7 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     known, declared = arm.matched.robot, Robot.from_document(documents[arm.robot])
     noise_rad, noise_m = fit.noise.robots[fit.robots.index(arm.robot)].tolist()
     repeats_mm, repeats_deg = known.repeatability
-    # Such an arm leaves as much anyway.
+    # An arm of this repeatability leaves as much anyway.
     is_usual = 1e3 * noise_m < repeats_mm and np.rad2deg(noise_rad) < repeats_deg
     if is_usual or not (known.masses is not None or arm.loads.any):
         return None

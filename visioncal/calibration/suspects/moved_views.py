@@ -336,10 +336,10 @@ def _common_change(
 ) -> tuple[str, FloatArray] | None:
     """The frame whose step explains most of some outliers, and the step; None where none does.
 
-    It leaves a third of them; up to `most`, as a share, where that is as much as others scatter by;
-    and no more than `leaves` [rad], or than others scatter by.
+    The step leaves a third of these; up to `most`, as a share, where that is as much as others
+    scatter by; and no more than `leaves` [rad], or than others scatter by.
 
-    Its name is empty where another size of the target does, or steps of several frames alike. Rows
+    The name is empty where another size of the target does, or steps of several frames alike. Rows
     with other poses, or of other images, have none in common.
     """
     some, state = np.isin(np.arange(len(inliers.problem)), rows), inliers.fit.state

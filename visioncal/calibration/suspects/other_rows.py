@@ -26,7 +26,7 @@ _NAMES = dict(zip(_PARTS, ("x_m", "y_m", "z_m", "qx to qw"), strict=True))
 def of_other_rows(run: RunState, rival_score: float) -> Iterator[Finding]:
     """The finding that some columns close the chain with the numbers of rows before or after.
 
-    Such numbers close it clearly better than another reading does, whose score is `rival_score`.
+    The chain closes clearly better by these than by another reading, whose score is `rival_score`.
     """
     if run.mount is None or run.mount == "instrument":
         return

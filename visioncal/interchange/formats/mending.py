@@ -180,7 +180,7 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
 
     Args:
         session: A session of measured poses or corners; where pictures are turned, of images, too.
-        views: Their numbers.
+        views: Numbers of the views.
         turn: Angle in the board's plane [deg], and the point about which it turns [mm]; of no
             angle, the shift in that plane [mm]. An angle alone, 90, 180 or 270 deg, is that by
             which pictures are turned clockwise.
@@ -277,7 +277,7 @@ def write_positions(
 
     Args:
         session: A session.
-        views: Their numbers.
+        views: Numbers of the views.
         axes: Factors and names of columns, for x, y and z each; positions are in metres.
 
     Raises:
@@ -311,7 +311,7 @@ def remove_tool(session: Session, views: Sequence[int], tool: Sequence[float]) -
 
     Args:
         session: A session.
-        views: Their numbers.
+        views: Numbers of the views.
         tool: The tool's x, y, z [mm] and rotation vector [deg] in the flange of the other views.
 
     Raises:

@@ -94,7 +94,7 @@ def convert(
         force: Whether an existing file may be replaced; a folder never is.
         choose: Called with what was read, unless the only reading that agrees with the images or
             the target's poses contradicts nothing stated; returns the reading to apply.
-        mends: What is mended, views and images; and whether that reading may mirror the robot's
+        mends: Views and images that are mended; and whether that reading may mirror the robot's
             poses.
 
     Returns:
