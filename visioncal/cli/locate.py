@@ -54,9 +54,9 @@ def locate_command(options: LocateOptions) -> None:
         session = Session.load(source)
         several = has_several(session)
     if session is not None and several:
-        own_target = target if target in session.plates else None
-        session = select(session, replace(choice, target=own_target), robot_between=False)
-        target = None if own_target else target
+        session_target = target if target in session.plates else None
+        session = select(session, replace(choice, target=session_target), robot_between=False)
+        target = None if session_target else target
     # Names may be those of the session alone.
     is_session_name = several and result.cell is None
     calibrated = result if is_session_name else result.chosen(choice, EYE)

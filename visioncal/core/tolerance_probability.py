@@ -89,8 +89,8 @@ def _crossings(
     """(n,) lower and upper r at which |known + r error| (n, 3) is the limit; equal for none."""
     length = np.maximum(np.linalg.norm(errors, axis=1), np.finfo(float).tiny)
     along = np.einsum("ni,ni->n", known, errors) / length
-    beside_sq = np.maximum(np.sum(known**2, axis=1) - along**2, 0.0)
-    half = np.sqrt(np.maximum(limit**2 - beside_sq, 0.0))
+    across_sq = np.maximum(np.sum(known**2, axis=1) - along**2, 0.0)
+    half = np.sqrt(np.maximum(limit**2 - across_sq, 0.0))
     # Of an error of next to nothing they are infinite.
     with np.errstate(over="ignore"):
         low, high = ((root - along) / length for root in (-half, half))

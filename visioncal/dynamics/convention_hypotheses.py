@@ -265,7 +265,7 @@ def _check_units(robot: Robot, label: str, measured: Measured) -> None:
     if not len(wrong):
         return
     tested = np.isfinite(scales).sum()
-    whose = "the torques" if len(wrong) == tested else f"the torques of {_named(tuple(wrong))}"
+    subject = "the torques" if len(wrong) == tested else f"the torques of {_named(tuple(wrong))}"
     scale = float(np.median(scales[wrong]))
     if scale > 200.0:
         unit = "are they mN m, or mA for A?"
@@ -279,7 +279,7 @@ def _check_units(robot: Robot, label: str, measured: Measured) -> None:
     else:
         unit = "are they of another unit, or currents with gains that are too small?"
     raise DataError(
-        f"{label}: {whose} are {figure(scale)} times what the inertias of {robot.name} need; "
+        f"{label}: {subject} are {figure(scale)} times what the inertias of {robot.name} need; "
         f"{unit}",
         culprits=[f"{label}, tau{index + 1}_nm" for index in wrong],
         next_step="Torques are those of the joints, behind the gears, in N m. Currents belong into "

@@ -183,8 +183,8 @@ class ArmData:
         poses, pair_jacobian = self.pair.jacobian(self.model.base_from_flange(q), perturbations)
         of_arm = pair_jacobian[:, :, -perturbations.shape[2] :]
         jacobian = np.concatenate([pair_jacobian[:, :, self.frames], of_arm], axis=2)
-        by_both = self.pair.place_jacobian(poses, jacobian, self.at)
-        return by_both[:, :, :-6], by_both[:, :, -6:]
+        whole = self.pair.place_jacobian(poses, jacobian, self.at)
+        return whole[:, :, :-6], whole[:, :, -6:]
 
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
         """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""

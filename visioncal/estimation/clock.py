@@ -200,8 +200,8 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
     scatter is the noise of the test (of a change point; Page 1955). A fit to both sides of a step
     is biased, so that the step is refined in a few rounds.
     """
-    chosen, own_s, weights = _own_offsets(robot, frames, fit)
-    change = _tested_change(frames.stamps_s[chosen], own_s, weights)
+    chosen, offsets_s, weights = _own_offsets(robot, frames, fit)
+    change = _tested_change(frames.stamps_s[chosen], offsets_s, weights)
     if change is None:
         return None
     for _ in range(3):
@@ -212,14 +212,14 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
         if frames.stack is not None:
             # A rolling shutter follows the motion, and would be taken for the clock's change.
             break
-        chosen, own_s, weights = _own_offsets(robot, corrected, fits[0])
-        more_s, sigma_s, _ = _fit_slope(change.shares(frames.stamps_s[chosen]), own_s, weights)
+        chosen, offsets_s, weights = _own_offsets(robot, corrected, fits[0])
+        more_s, sigma_s, _ = _fit_slope(change.shares(frames.stamps_s[chosen]), offsets_s, weights)
         change = replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
     return change
 
 
 def _tested_change(
-    times_s: FloatArray, own_s: FloatArray, weights: FloatArray
+    times_s: FloatArray, offsets_s: FloatArray, weights: FloatArray
 ) -> ClockChange | None:
     """The most significant step or drift of frames' own offsets (m,) [s]."""
     stretch_of = _stretches(times_s)
@@ -230,7 +230,7 @@ def _tested_change(
     information = information[valid]
     means, times = (
         np.bincount(stretch_of, weights * values)[valid] / information
-        for values in (own_s, times_s)
+        for values in (offsets_s, times_s)
     )
     columns = [times - times[0], *((times >= middle).astype(float) for middle in times[2:-1])]
     scored = [_fit_slope(column, means, information) for column in columns]
@@ -242,7 +242,7 @@ def _tested_change(
         return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
     # The most significant frame within the neighbouring stretches.
     nearby = times_s[(times_s >= times[best]) & (times_s <= times[best + 2])]
-    scores = [_fit_slope((times_s >= at).astype(float), own_s, weights)[2] for at in nearby]
+    scores = [_fit_slope((times_s >= at).astype(float), offsets_s, weights)[2] for at in nearby]
     return ClockChange(float(nearby[int(np.argmax(scores))]), step_s, sigma_s, is_drift=False)
 
 

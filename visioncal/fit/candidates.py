@@ -186,10 +186,10 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
                 # Tilts of a plane look much like it: beyond, arms' errors would be taken for it.
                 member = starting_at(random_effect(effect), size, _SHOWN * size)
                 yield Candidate(gain, member, effect)
-        opened_there = {known.name for known in fit.unknowns.effects}
+        opened_names = {known.name for known in fit.unknowns.effects}
         displacements = (Window.tried(camera), *_sags(fit, pairs, camera))
         for tried in displacements:
-            if tried[0].name not in opened_there and images_of(pairs, camera):
+            if tried[0].name not in opened_names and images_of(pairs, camera):
                 best, size, gain = best_displacement(fit, pairs, tried)
                 yield Candidate(gain, starting_at(random_effect(best), size), best)
 
@@ -336,9 +336,9 @@ def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
     if len(stood) >= processes.ENOUGH_STOPS:
         is_swept = any(sweep.flange == flange for sweep in fit.cell.sweeps)
         robot = arm.model if arm.has_joints else None
-        stood_there = Stood(arm.poses, stood, is_swept, _beside(fit, flange), robot)
+        standing = Stood(arm.poses, stood, is_swept, _beside(fit, flange), robot)
         for kind in NAMED:
-            yield from kind.of_flange(flange, stood_there)
+            yield from kind.of_flange(flange, standing)
 
 
 def _beside(fit: Fit, flange: str) -> tuple[float, ...]:

@@ -183,10 +183,10 @@ class Fit:
         common = self.estimate.covariance[columns[:, None], columns]
         covariance = covariance + jacobian @ common @ np.swapaxes(jacobian, 1, 2)
         part = self.used[gram.rows][:, None, None]
-        own_pose = measured @ heads[:, :6, -1, None]
+        measured_step = measured @ heads[:, :6, -1, None]
         share = part * np.linalg.solve(measured, covariance).swapaxes(1, 2)
         rest, known = np.eye(6) - share, values[:, :, None]
-        away = own_pose - np.linalg.solve(rest, known - share @ own_pose)
+        away = measured_step - np.linalg.solve(rest, known - share @ measured_step)
         return away[:, :, 0], np.asarray(np.linalg.solve(rest, covariance), dtype=float), measured
 
     def predict(self, seer: str, seen: str, moments: Moments) -> Prediction:

@@ -354,16 +354,16 @@ def corner_rows(
     for effect in unknowns.effects:
         if effect.frame != seer or effect.place == "edge" or isinstance(effect, Rolling):
             continue
-        by_own = found.jacobian_intrinsics
+        by_effect = found.jacobian_intrinsics
         if isinstance(effect, RowMotion):
-            by_own = columns["effect", effect.name] = effect.shifts(pair.px)
+            by_effect = columns["effect", effect.name] = effect.shifts(pair.px)
         if isinstance(effect, Displacement):
             seen_at = apply_each(corner_poses, points)
-            by_own = found.jacobian_point @ effect.moved(seen_at, corner_poses)
-            columns["effect", effect.name] = by_own
+            by_effect = found.jacobian_point @ effect.moved(seen_at, corner_poses)
+            columns["effect", effect.name] = by_effect
         columns_of = effect.columns(pair.moments, pair.distances(poses))
         moved = columns_of @ state.values["effect", effect.name]
-        residual = residual - (by_own @ moved[pair.owner, :, None])[:, :, 0]
+        residual = residual - (by_effect @ moved[pair.owner, :, None])[:, :, 0]
     functions = np.zeros((len(residual), 0))
     if seer in unknowns.fields:
         # Where corners are predicted: at those seen, a field could explain their noise.

@@ -37,14 +37,14 @@ def with_other_tip(
     fit = min((_fitted(pairs, poses, length) for length in _LENGTHS_M), key=lambda at: at.sigma)
     if fit.sigma > DISAGREE_M or CLEAR_RATIO * fit.sigma > off_m:
         return error
-    tip, whose = fit.state.points[0], "as poses of the tip itself (--tool none)"
+    tip, reference = fit.state.points[0], "as poses of the tip itself (--tool none)"
     if tool is not None:
         stated = _words(tool.edge.matrix[:3, 3])
-        whose = f"with {tool.name}, whose tip is at {stated} mm"
+        reference = f"with {tool.name}, whose tip is at {stated} mm"
     return DataError(
         f"fixture: another tool touched, or the poses are of another frame: with a tip at "
         f"{_words(tip)} mm in the frame of the poses, the points fit the drawing to "
-        f"{figure(1e3 * fit.sigma)} mm per axis, and to {figure(1e3 * off_m)} mm {whose}.",
+        f"{figure(1e3 * fit.sigma)} mm per axis, and to {figure(1e3 * off_m)} mm {reference}.",
         culprits=["--tool"],
         next_step="Name the tool that touched with --tool; --tool none is for poses of its tip.",
     )

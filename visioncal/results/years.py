@@ -64,12 +64,12 @@ class Course:
             The likeliest time, and the earliest and the latest of 95 %: a century on for never.
         """
         last = self.entries[-1]
-        own_mm = last.good_for_mm or 1e3 * radius95(last.edges[self.name].covariance[3:, 3:])
+        latest_mm = last.good_for_mm or 1e3 * radius95(last.edges[self.name].covariance[3:, 3:])
         drift_mm, covariance = 1e3 * drift.vector[-3:], 1e6 * drift.covariance[-3:, -3:]
         speed = max(float(np.linalg.norm(drift_mm)), 1e-9)
         reach = 1.96 * float(np.sqrt(drift_mm @ covariance @ drift_mm)) / speed
         likely, early, late = (
-            last.time + timedelta(days=YEAR_DAYS * min(100.0, max(need_mm - own_mm, 0.0) / rate))
+            last.time + timedelta(days=YEAR_DAYS * min(100.0, max(need_mm - latest_mm, 0.0) / rate))
             for rate in (speed, speed + reach, max(speed - reach, 1e-9))
         )
         return likely, early, late

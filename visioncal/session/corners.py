@@ -176,8 +176,8 @@ def with_corners(
     added: list[View] = []
     new, stop = (1 + max([0, *mapping]) for mapping in (rows, (view.stop or 0 for view in views)))
     for number in list(rows):
-        own_rows = np.flatnonzero(table.views == number)
-        boards = list(dict.fromkeys(shown[at] for at in own_rows))
+        view_rows = np.flatnonzero(table.views == number)
+        boards = list(dict.fromkeys(shown[at] for at in view_rows))
         if not boards:
             continue
         if len(boards) > 1 and rows[number].stop is None:
@@ -185,7 +185,7 @@ def with_corners(
         rows[number] = _with_board(rows[number], boards[0])
         for board in boards[1:]:
             added.append(replace(_with_board(rows[number], board), number=new))
-            numbers[[at for at in own_rows if shown[at] == board]] = new
+            numbers[[at for at in view_rows if shown[at] == board]] = new
             new += 1
     more = [name for name in ("stop", COLUMN) if name not in columns]
     wanted = {"stop": any(row.stop is not None for row in rows.values()), COLUMN: True}

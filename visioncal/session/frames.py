@@ -222,8 +222,8 @@ class _DeclaredTree:
             moved = [row for row in read if has_robot_state(row)]
             if moved:
                 return self._flange_of(frame) if len(moved) == len(read) else None
-            is_alone = len(self.robots) < 2 and not self.declaration.is_network
-            return self._flange_of(frame) if is_alone else CELL
+            is_single = len(self.robots) < 2 and not self.declaration.is_network
+            return self._flange_of(frame) if is_single else CELL
         moves = {"eye-in-hand": "camera", "eye-to-hand": "target"}.get(self.declaration.mount or "")
         if moves is not None:
             return self._flange_of(frame) if kind == moves else CELL

@@ -124,7 +124,7 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
         declared = list(declaration.named(kind))
         is_plain = declared in ([], [""])
         names = sorted({*named.values()} - {""})
-        needs, whose = _NAMING_RULES[kind]
+        needs, needed_rows = _NAMING_RULES[kind]
         # A column of one name beside a singular table is no matter.
         unknown = [name for name in names if name not in declared] if len(names) > is_plain else []
         if unknown:
@@ -143,7 +143,7 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
         if len(declared) > 1 and without:
             raise DataError(
                 f"views.csv: of several {kind}s ({', '.join(declared)}), the column {kind} must "
-                f"name {whose}; it is empty in view {some_of(without)}.",
+                f"name {needed_rows}; it is empty in view {some_of(without)}.",
                 culprits=[f"views.csv: view {name}" for name in without],
                 next_step=f"Name the {kind} in each of these rows.",
             )

@@ -138,14 +138,16 @@ def verify(
     session = session if isinstance(session, Session) else Session.load(session)
     if not isinstance(calibration, Calibration):
         calibration = Calibration.load(calibration)
-    is_its_own = session.digest() == calibration.session_sha256
+    is_calibrated = session.digest() == calibration.session_sha256
     session, calibration = select_matching(session, calibration, Choice(camera, robot, target))
     # Views of its own session that the calibration rejected are rejected here, too.
-    without = {view.view: view.reason for view in calibration.views if is_its_own and not view.used}
+    without = {
+        view.view: view.reason for view in calibration.views if is_calibrated and not view.used
+    }
     prior = CalibrationPrior.of(calibration)
     predicted = predict_stops(session, prior, progress, without)
     found = check(
-        predicted, prior, board_placed_anew=board_placed_anew, with_repeats=not is_its_own
+        predicted, prior, board_placed_anew=board_placed_anew, with_repeats=not is_calibrated
     )
     if not any(view.depth for view in session.views):
         return found

@@ -212,7 +212,7 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     share = min(1.0, float(np.sqrt(_FAR / max(squared, 1e-12))))
     clipped = share * white
     # Gains on whitened innovations.
-    gain, own_gain = (whiten @ seen).T, (whiten @ offset_covariance).T
+    gain, offset_gain = (whiten @ seen).T, (whiten @ offset_covariance).T
     signature = whiten @ (change - design @ follows)
     turned = np.swapaxes(signature, 1, 2)
     products, accepted = turned @ signature, np.ones(len(follows))
@@ -234,8 +234,8 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     covariance = kept @ covariance @ kept.T + filled @ by_look @ filled.T
     # The arm's error at a posture is learned beside the state, and its small share in what the
     # filter takes of a change is left out: it costs a little delay and no false alarm.
-    places["offsets"][at] += own_gain @ clipped
-    places["offsets_covariance"][at] -= own_gain @ own_gain.T
+    places["offsets"][at] += offset_gain @ clipped
+    places["offsets_covariance"][at] -= offset_gain @ offset_gain.T
     learned: dict[str, FloatArray] = {}
     if is_learning:
         # Of the noise in units of the stated: expectation and maximisation (Shumway and Stoffer

@@ -172,9 +172,9 @@ def verdict_of(check: Check) -> Verdict:
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
     # Where something else has changed, too, its probability among those compared says little; and
     # beside changes that are not separated it would say that they are.
-    share, is_alone = likeliest.probability, check.explained
+    share, is_explained = likeliest.probability, check.explained
     is_separated = all(rival.probability * CheckLimits.ruled_out >= share for rival in others)
-    is_limit = not is_alone or not is_separated
+    is_limit = not is_explained or not is_separated
     step = _step(check, likeliest)
     reasons = [Finding(kind, words, step, probability=share, by_limit=is_limit)]
     if others:

@@ -261,13 +261,13 @@ def _other_target(message: str, next_step: str) -> DataError:
 
 def _differences(prior: CalibrationPrior, name: str, target: Target) -> list[str]:
     """Differences in print between a target and the calibrated one, without its size's sigma."""
-    ours, theirs = target_document(prior.targets[name]), target_document(target)
+    calibrated, checked = target_document(prior.targets[name]), target_document(target)
     return [
         "image is of another picture"
         if field == "image"
-        else f"{field} = {shorten(theirs.get(field))}, not {shorten(ours.get(field))}"
-        for field in {**ours, **theirs}
-        if ours.get(field) != theirs.get(field) and field != "square_sigma_m"
+        else f"{field} = {shorten(checked.get(field))}, not {shorten(calibrated.get(field))}"
+        for field in {**calibrated, **checked}
+        if calibrated.get(field) != checked.get(field) and field != "square_sigma_m"
     ]
 
 
@@ -287,8 +287,8 @@ def check_robot(session: Session, stated: Robot, calibrated: Robot, *others: Rob
     for model in (calibrated, *others):
         if model.joint_count == stated.joint_count:
             # Motions are compared: the calibrated base may have been moved to the poses' frame.
-            ours, theirs = (robot.base_from_flange(q) for robot in (model, stated))
-            between = [invert(array[0]) @ array for array in (ours, theirs)]
+            model_poses, stated_poses = (robot.base_from_flange(q) for robot in (model, stated))
+            between = [invert(array[0]) @ array for array in (model_poses, stated_poses)]
             if np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT:
                 return
     raise DataError(

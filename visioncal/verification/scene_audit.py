@@ -97,8 +97,8 @@ def scene_moves(
             else:
                 # An image that agrees with others that are lost shows another part of the scene.
                 lost.append(current)
-                is_there = len(lost) >= 3 and not compared(image_at(lost[0]), image).reason
-                if not is_there:
+                is_confirmed = len(lost) >= 3 and not compared(image_at(lost[0]), image).reason
+                if not is_confirmed:
                     continue
             places.append(current)
             if watch.holds and not lost:

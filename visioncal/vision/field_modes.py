@@ -45,7 +45,7 @@ class FieldModes:
         """(n, 2) displacements by (2 e,) coefficients of both axes."""
         table = np.zeros((2, self.by_x.shape[1], self.by_y.shape[1]))
         table[:, *self.pairs] = values.reshape(2, -1)
-        return np.stack([np.sum(self.by_x @ by_both * self.by_y, axis=1) for by_both in table], 1)
+        return np.stack([np.sum(self.by_x @ by_modes * self.by_y, axis=1) for by_modes in table], 1)
 
 
 def field_modes(

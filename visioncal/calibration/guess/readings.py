@@ -253,28 +253,28 @@ def _components(form: str) -> Iterator[Change]:
     With one other sign, a rotation vector's rotation R is H R^T H, with a half turn H about its
     axis: transposed, and with the other two signs in the positions, it closes the chain alike.
     """
-    size, whose = ROTATION_FORMS[form].size, "the robot's rotations"
+    size, subject = ROTATION_FORMS[form].size, "the robot's rotations"
     fields, names = dict[str, Any](), ("number 1", "number 2", "number 3")
     if size != 3:
         # The vector of a quaternion is along that of the rotation.
         fields, names = {"rotation": "rotation-vector", "written": "rotation-vector"}, (*"xyz",)
-        whose += " (of qx, qy, qz, or of rx, ry, rz)"
+        subject += " (of qx, qy, qz, or of rx, ry, rz)"
     is_vector = not form.startswith("euler-")
     if form.endswith("-deg"):
-        yield Change(f"{whose} in gon (400 to a turn)", "robot", {"angle_unit": _GON})
+        yield Change(f"{subject} in gon (400 to a turn)", "robot", {"angle_unit": _GON})
     if is_vector:
         # Transposed, it has the other three signs.
         fields["transposed"] = False
     for signs, named, cost in _signs(names):
         if not (is_vector and cost == 3):
             terms = tuple((np.arange(1, 4) * signs).tolist())
-            words = f"another sign of {named} in {whose}"
+            words = f"another sign of {named} in {subject}"
             yield Change(words, "robot", {**fields, "terms": terms}, cost)
     for axes, named, cost in _orders() if is_vector else ():
         # The first and last are exchanged as where Euler angles ZYX are taken for xyz: `rewritten`.
         if size == 3 or axes != (2, 1, 0):
             terms = tuple(1 + axis for axis in axes)
-            words = f"the numbers of {whose} taken as {named}"
+            words = f"the numbers of {subject} taken as {named}"
             yield Change(words, "robot", {**fields, "terms": terms}, cost)
 
 
@@ -284,15 +284,15 @@ def _units(part: Literal["robot", "camera"], side: SideReading, words: str) -> I
 
 
 def _changes_of_side(part: Literal["robot", "camera"], side: SideReading) -> Iterator[Change]:
-    whose, size = f"the {part}'s", ROTATION_FORMS[side.rotation].size
-    yield from _units(part, side, f"{whose} positions in")
+    owner, size = f"the {part}'s", ROTATION_FORMS[side.rotation].size
+    yield from _units(part, side, f"{owner} positions in")
     # A matrix by columns is one by rows, transposed, and that is tried for every form.
     for name, form in ROTATION_FORMS.items():
         if form.size == size != 9 and name != side.rotation:
-            yield Change(f"{whose} rotations as {form.words}", part, {"rotation": name})
+            yield Change(f"{owner} rotations as {form.words}", part, {"rotation": name})
     given = "as given, not inverse" if side.inverse else "inverse"
-    yield Change(f"{whose} poses {given}", part, {"inverse": not side.inverse})
-    yield Change(f"{whose} rotations transposed", part, {"transposed": True})
+    yield Change(f"{owner} poses {given}", part, {"inverse": not side.inverse})
+    yield Change(f"{owner} rotations transposed", part, {"transposed": True})
 
 
 def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change]:

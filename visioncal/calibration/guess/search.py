@@ -234,10 +234,10 @@ def _of_another_size(
         scale, _ = found_factor
         if abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
             continue
-        whose = (
+        subject = (
             "the board" if recording.is_measured else "the camera's distances, and so the board,"
         )
-        change = Change(f"{whose} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
+        change = Change(f"{subject} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
         scaled[change.of(item.hypothesis)] = (*map(change.of, item.labels),)
         as_stated[change.of(item.hypothesis)] = min(item.misfit, declared.misfit)
     found = fitted(recording, scaled, rows, STARTS) if scaled else []

@@ -199,7 +199,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
     if too_few_digits is not None:
         yield too_few_digits
     elif 1e3 * metres > max(limits.sigma_mm[0], limits.repeatability * repeats_mm):
-        whose = "industrial arms repeat" if run.robot is None else "this arm repeats"
+        comparison = "industrial arms repeat" if run.robot is None else "this arm repeats"
         causes = "the board is of another size than stated, the lens is not this camera's"
         if not run.scenes:
             causes = "the marker has few pixels or its other pose was taken, the mount is wrong"
@@ -207,7 +207,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
         yield Finding(
             "scatter",
             f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} from stop to stop, "
-            f"and {whose} to {repeats_mm:g} mm: {causes}, the poses are not of these "
+            f"and {comparison} to {repeats_mm:g} mm: {causes}, the poses are not of these "
             f"{'images' if run.scenes else 'rows'}{servo}.",
             Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
@@ -243,7 +243,7 @@ def _contents(run: RunState) -> Iterator[str]:
     for robot, reported in run.robots.items():
         # Rows of one stop share a pose.
         if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
-            whose = f"robot {robot}" if len(run.robots) > 1 else "the robot"
-            yield f"{counted(len(poses), 'pose')} of {whose}"
+            label = f"robot {robot}" if len(run.robots) > 1 else "the robot"
+            yield f"{counted(len(poses), 'pose')} of {label}"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"

@@ -101,8 +101,8 @@ def _with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], problem: Problem
     # Corners of one image may have a common error, as those of small squares do: poses then
     # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
     # once a stop, that is part of the robot's noise.
-    is_alone = cell.mount is not None and len(problem.units[1]) == len(problem)
-    if is_alone or problem.is_combined:
+    is_single = cell.mount is not None and len(problem.units[1]) == len(problem)
+    if is_single or problem.is_combined:
         return problem
     sensors = sensors_of(cell, poses)
     frames = tuple(dict.fromkeys((*sensors, *(row.seer for row in cell.rows))))

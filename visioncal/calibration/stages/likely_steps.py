@@ -124,9 +124,9 @@ def likely_steps(
         single = _weighed(replace(step, gain=gain - penalty), apart, solution, errors)
         if double is not None and (drift is None or double[0].gain - 2.0 * penalty > drift.gain):
             second = replace(double[0], gain=double[0].gain - 2.0 * penalty)
-            of_both = _weighed(second, *double[1:], errors)
-            if of_both.step.gain - single.step.gain > _CLEARLY:
-                likely.append(of_both)
+            weighed = _weighed(second, *double[1:], errors)
+            if weighed.step.gain - single.step.gain > _CLEARLY:
+                likely.append(weighed)
                 continue
         if drift is None or step.gain - penalty >= drift.gain:
             likely.append(single)

@@ -369,8 +369,8 @@ def _flange_covariance(
         flange_m = fit.flanges[robot][stops, :3, 3]
         lever_m2 = np.sum((in_base[:, :3, 3] - flange_m) ** 2, axis=1)
         # With equal rotations about three axes, a point moves by two of their components.
-        own_m2 = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
-        covariance[:, 3:, 3:] = own_m2[:, None, None] * np.eye(3)
+        position_m2 = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
+        covariance[:, 3:, 3:] = position_m2[:, None, None] * np.eye(3)
     return covariance
 
 

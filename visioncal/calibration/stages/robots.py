@@ -260,8 +260,8 @@ def pairs_of(observed: Observed, robot: str) -> list[CameraTargetPair]:
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
     for observation in observed.timed.observations:
         view = observation.view.number
-        is_alone = [*observation.robots, *observation.missing_robots] == [robot]
-        if view in observed.poses and is_camera_observation(observation.view) and is_alone:
+        is_single = [*observation.robots, *observation.missing_robots] == [robot]
+        if view in observed.poses and is_camera_observation(observation.view) and is_single:
             pairs.setdefault((observation.seer, observation.seen), {})[view] = observed.poses[view]
     flange, found_pairs = frame_name("flange", robot), []
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):

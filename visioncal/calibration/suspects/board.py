@@ -87,12 +87,12 @@ def _of_prints(run: RunState) -> Iterator[Finding]:
             write, command = board_correction(run.session, name, f"diameter_m = {size:.4g}")
             document = run.session.target_document
             is_usual = document is not None and "diameter_m" not in document
-            whose = "is usual" if is_usual else "stated"
+            source = "is usual" if is_usual else "stated"
             yield Finding(
                 "print_size",
                 f"The circles of {f'the board {name}'.strip()} are {1e3 * size:.4g} mm wide in the "
                 f"images, by the distance of rows (sigma {figure(1e3 * sigma)} mm), not "
-                f"{1e3 * target.diameter_m:g} mm as {whose}. Their centres were fitted so; "
+                f"{1e3 * target.diameter_m:g} mm as {source}. Their centres were fitted so; "
                 f"{write}.",
                 Remedy(f"{write[0].upper()}{write[1:]}.", command),
             )

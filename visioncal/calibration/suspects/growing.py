@@ -22,14 +22,14 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
     fit, effect, arms = run.assessment.fit, KINDS[kind], run.cell_fit.arms.values()
     # Errors of arms from stop to stop look like it: there the covariance, which has these, says
     # what chance explains.
-    is_alone = not any(arm.errors is not None and arm.errors.is_significant for arm in arms)
+    is_sole = not any(arm.errors is not None and arm.errors.is_significant for arm in arms)
     for owner in fit.unknowns.of(kind):
         shown = fit.unknowns.moved[fit.unknowns.columns((kind, owner))]
         values = fit.values((kind, owner)) + run.cell_fit.sizes.steadied_by(kind, owner)
         values = values[shown]
         covariance = fit.covariance((kind, owner))[np.ix_(shown, shown)]
         squared = float(values @ np.linalg.solve(covariance, values))
-        if is_alone or issubclass(effect, LensEffect):
+        if is_sole or issubclass(effect, LensEffect):
             squared = max(squared, run.cell_fit.gains.get(f"{kind} of {owner}", 0.0))
         if issubclass(effect, BracketBends) and np.greater(effect.up_to(values), _MOST_BENDS).any():
             continue

@@ -145,8 +145,10 @@ def with_undone(run: RunState) -> RunState:
             mistake = likeliest(of_pair(run, robot, pair), stops)
             if mistake is None:
                 continue
-            whose = robot_words(robot)
-            whose = f"{whose[0].upper()}{whose[1:]}, in its rows of {pair.camera} and {pair.target}"
+            subject = robot_words(robot)
+            subject = (
+                f"{subject[0].upper()}{subject[1:]}, in its rows of {pair.camera} and {pair.target}"
+            )
             found, do = mistake.found, mistake.found.do
             if do is not None and "--views" in do.command:
                 # The other views are those of all pairs.
@@ -154,7 +156,7 @@ def with_undone(run: RunState) -> RunState:
                 do = or_alone(do.words, others)
             else:
                 do = of_all_rows(found, run, robot, pair)
-            found = replace(found, words=f"{whose}: {found.words}", do=do)
+            found = replace(found, words=f"{subject}: {found.words}", do=do)
             # One command mends the robot's rows of all pairs.
             command = "" if do is None else do.command
             run = undone(run, replace(mistake, found=found), is_named=command in commands)
@@ -184,7 +186,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         return
     for robot in (name for name in run.session.robots if name in run.robots):
         wrong, right = open_pairs(run, robot, run.robots[robot].base_from_flange)
-        whose = robot_words(robot)
+        subject = robot_words(robot)
         for pair in wrong:
             if (other := _on_another(run, robot, pair)) is not None:
                 yield other
@@ -197,7 +199,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
                 # Through other cameras or targets its poses are right.
                 seen = " and ".join(filter(None, [pair.camera, pair.target]))
                 within = f", in its rows of {seen}"
-            words = f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}"
+            words = f"{subject[0].upper()}{subject[1:]}{within}: {hint.words}"
             yield replace(hint, words=words, do=of_all_rows(hint, run, robot))
             # All of these would show the same.
             break
@@ -291,8 +293,8 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     if np.median(away) > _ALIKE_RAD and (late := _on_the_way(robot, by_camera, kept)) is not None:
         yield late
         return
-    if np.median(away) > _ALIKE_RAD and (whose := _half_turned(pairs)):
-        yield Finding("misread_poses", f"The {whose}'s rotations {_HALF_TURNS}", _REAL_PART)
+    if np.median(away) > _ALIKE_RAD and (side_name := _half_turned(pairs)):
+        yield Finding("misread_poses", f"The {side_name}'s rotations {_HALF_TURNS}", _REAL_PART)
         return
     words = "The robot's poses are not those of the images: "
     if np.ptp(pairs[:, 0, :3, 3], axis=0).max() < _STILL_M:
@@ -312,11 +314,11 @@ def _half_turned(pairs: FloatArray) -> str:
 
     Rotations of a tool that points straight down are, too, but about axes in one plane.
     """
-    for whose, poses in zip(("robot", "target"), pairs.swapaxes(0, 1), strict=True):
+    for side, poses in zip(("robot", "target"), pairs.swapaxes(0, 1), strict=True):
         turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
         spread = np.linalg.svd(turns, compute_uv=False)[-1] / np.sqrt(len(turns))
         if np.linalg.norm(turns, axis=1).min() > np.pi - _ALIKE_RAD and spread > 3 * _ALIKE_RAD:
-            return whose
+            return side
     return ""
 
 
@@ -402,10 +404,10 @@ def turned_boards(run: RunState) -> Iterator[Finding]:
             if view.has_corners and view.number in run.poses and session.board_of(view) == name
         ]
         if are_from_behind([(session.corners[view.number], target) for view in views]):
-            whose = f"target {name}" if name else "the board"
+            subject = f"target {name}" if name else "the board"
             yield Finding(
                 "corner_numbers",
-                f"corners.csv numbers the corners of {whose} as if it was seen from behind: rows "
+                f"corners.csv numbers the corners of {subject} as if it was seen from behind: rows "
                 "from the bottom up, column by column, or counterclockwise. The camera's pose "
                 "holds, but the board's frame is turned over: its z axis points at the camera.",
                 Remedy(

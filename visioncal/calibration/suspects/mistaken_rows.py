@@ -79,12 +79,12 @@ def copied_rows(
         chance = max(float((copies & agrees).mean()), _EQUAL)
         views = tuple(record.views[record.rows[copied]].tolist())
         others = record.views[record.rows[~copied]].tolist()
-        whose = f"{view_words(views).capitalize()} {'have' if len(views) > 1 else 'has'}"
+        subject = f"{view_words(views).capitalize()} {'have' if len(views) > 1 else 'has'}"
         yield Undoing(
             MISTAKE - len(views) * float(np.log(chance)),
             Finding(
                 "copied_poses",
-                f"{whose} {pose} of the row before once more, {but}. Left out.",
+                f"{subject} {pose} of the row before once more, {but}. Left out.",
                 or_alone(f"{do}, or calibrate the other views alone.", others),
                 views,
             ),
@@ -171,8 +171,8 @@ def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[U
         if log is None:
             continue
         views = tuple(record.views[record.rows[wrong[paired] & (paired >= 0)]].tolist())
-        whose = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
-        short = f"{whose} is {unit} as in the others, as where it is in another unit"
+        subject = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
+        short = f"{subject} is {unit} as in the others, as where it is in another unit"
         axes = ",".join(f"{factor:g}*{at}_m" if at in part else at for at in "xyz")
         yield Undoing(
             EVIDENCE * float(log - base) + MISTAKE,

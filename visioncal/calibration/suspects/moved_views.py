@@ -372,8 +372,8 @@ def _common_change(
         return "", np.eye(4)
     if ratio >= most:
         return None
-    is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
-    return (frame if is_alone else ""), step
+    is_clear = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
+    return (frame if is_clear else ""), step
 
 
 def _alike(

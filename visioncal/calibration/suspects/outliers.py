@@ -171,16 +171,16 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
         through = [pair for pair in pairs if pair[0] in by_robot]
         by_stops = Counter(tuple(sorted(rows[at].station for at in pair)) for pair in through)
         for stations, count in by_stops.items():
-            at_both = [at for at in by_robot if rows[at].station in stations]
+            at_stops = [at for at in by_robot if rows[at].station in stations]
             # One observation of a stop may itself be wrong.
-            if count < 2 or used[at_both].any():
+            if count < 2 or used[at_stops].any():
                 continue
             first, second = (cell_fit.cell.stops[station] for station in stations)
             short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
             words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
-            do = _exchange(cell_fit, at_both, stations)
-            yield fault_of(cell_fit, EXCHANGED, at_both, words, do, short)
-            pairs = [pair for pair in pairs if pair[0] not in at_both]
+            do = _exchange(cell_fit, at_stops, stations)
+            yield fault_of(cell_fit, EXCHANGED, at_stops, words, do, short)
+            pairs = [pair for pair in pairs if pair[0] not in at_stops]
     if not pairs:
         return
     if len(pairs) > 2 and len({sum(pair) for pair in pairs}) == 1:

@@ -127,8 +127,8 @@ def _sessions_of(given: str) -> Iterator[Path]:
     path, is_glob = Path(given), bool({*given} & {*"*?["}) and not Path(given).exists()
     below = str(path.relative_to(path.anchor))
     for found in Path(path.anchor).glob(below) if is_glob else [path]:
-        has_own = not found.is_dir() or (found / _SESSION).exists()
-        inner = [] if has_own else [file.parent for file in found.rglob(_SESSION)]
+        is_session = not found.is_dir() or (found / _SESSION).exists()
+        inner = [] if is_session else [file.parent for file in found.rglob(_SESSION)]
         # Other files beside sessions, such as truths and notes, are skipped.
         if not is_glob or found.is_dir() or found.suffix.lower() == ".rrd":
             yield from inner or [found]

@@ -397,9 +397,9 @@ def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) 
         if size is not None:
             lens["resolution"] = list(size)
         elif "matrix" in lens or not paths:
-            whose = "the intrinsics do not say" if "matrix" in lens else "the corners do not say"
+            source = "the intrinsics do not say" if "matrix" in lens else "the corners do not say"
             raise DataError(
-                f"{foreign.name}: {whose} for which size of image they hold, and no image can be "
+                f"{foreign.name}: {source} for which size of image they hold, and no image can be "
                 "read.",
                 culprits=["resolution"],
                 next_step="Give --resolution WIDTH,HEIGHT.",

@@ -195,10 +195,10 @@ def _recordings(
     unstated: dict[Side, Unstated] = {}
     joints, notes = _joint_angles(fields, joint_fields, requested, bool(names["robot"]))
     notes += fields.notes
-    for whose, of_side in names.items():
+    for side, of_side in names.items():
         if of_side:
-            side_options = requested.robot if whose == "robot" else requested.camera
-            poses[whose], more, unstated[whose] = poses_from(fields, of_side, side_options, whose)
+            side_options = requested.robot if side == "robot" else requested.camera
+            poses[side], more, unstated[side] = poses_from(fields, of_side, side_options, side)
             notes += more
     if irregular := [name for name in fields.shape_errors if name not in used]:
         notes.append(f"Left aside, as rows differ in their shape: {some_of(irregular)}.")
@@ -246,13 +246,13 @@ def _recordings(
     return [(0, foreign), *((1, other) for other in others)]
 
 
-def _unnamed(fields: Fields, whose: Side, others: str = "") -> DataError:
+def _unnamed(fields: Fields, side: Side, others: str = "") -> DataError:
     word = named_by(fields.places[0])
     return DataError(
-        f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
+        f"{fields.name}: which of its fields are the {side}'s poses is not known; it has "
         f"{fields.listing()}.",
         culprits=[fields.name],
-        next_step=f"Name them with --{whose}-{word}{others.format(word)}.",
+        next_step=f"Name them with --{side}-{word}{others.format(word)}.",
     )
 
 
@@ -265,9 +265,9 @@ def _pose_fields(fields: Fields, requested: ImportOptions) -> dict[Side, tuple[s
     ]
     names: dict[Side, tuple[str, ...]] = {"robot": (), "camera": ()}
     # Columns that the user names of one side are not the other's.
-    for whose, side_options in sorted(sides, key=lambda side: not side[1].names):
-        names[whose] = pose_names(fields, side_options.names, whose, used)
-        used.update(names[whose])
+    for side_name, side_options in sorted(sides, key=lambda side: not side[1].names):
+        names[side_name] = pose_names(fields, side_options.names, side_name, used)
+        used.update(names[side_name])
     return names
 
 
@@ -329,8 +329,8 @@ def _readings(
     cells = [
         ["" if np.isnan(v) else repr(v) for v in row] for row in (UNITS_M[unit] * places.T).tolist()
     ]
-    whose = "points that the camera measured," if points else "an instrument's readings"
-    note = f"{', '.join(names)} are taken for {whose} in {unit}."
+    kind = "points that the camera measured," if points else "an instrument's readings"
+    note = f"{', '.join(names)} are taken for {kind} in {unit}."
     return dict(zip(INSTRUMENT_POSITION, map(tuple, cells), strict=True)), (note,)
 
 
@@ -469,15 +469,15 @@ def with_camera_file(
 
 
 def _poses(
-    fields: Fields, requested: PoseImportOptions, whose: Side
+    fields: Fields, requested: PoseImportOptions, side: Side
 ) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...], Unstated]:
     """Reads the poses of one file: (poses, their fields, notes on assumptions, what is assumed)."""
     # A file of camera poses alone may use the names of a robot's file.
-    candidates = (pose_names(fields, requested.names, name, ()) for name in (whose, "robot"))
+    candidates = (pose_names(fields, requested.names, name, ()) for name in (side, "robot"))
     names = next(filter(None, candidates), ())
     if not names:
-        raise _unnamed(fields, whose)
-    poses, notes, unstated = poses_from(fields, names, requested, whose)
+        raise _unnamed(fields, side)
+    poses, notes, unstated = poses_from(fields, names, requested, side)
     return poses, names, notes, unstated
 
 

@@ -350,17 +350,17 @@ def joined(
     clusters: list[list[tuple[Fields, IntArray]]] = []
     each = (piece for part in parts for piece in _by_category(part))
     for part in sorted(each, key=lambda item: (not holds_pose(item), -len(item))):
-        is_alone = True
+        is_unmatched = True
         for cluster in clusters:
             main = cluster[0][0]
             match = _match(main, part)
             # Rows that name images may do so for several others.
-            if match is not None and (is_alone or match.how != HOW[-1]):
+            if match is not None and (is_unmatched or match.how != HOW[-1]):
                 cluster.append((part, match.rows))
-                is_alone = False
+                is_unmatched = False
                 if holds_pose(part):
                     break
-        if is_alone:
+        if is_unmatched:
             clusters.append([(part, np.arange(len(part)))])
     return [
         cluster[0][0] if len(cluster) == 1 else _merged(cluster, name, folder, prefixed=prefixed)

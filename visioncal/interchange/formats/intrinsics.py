@@ -128,8 +128,8 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """
     if path.suffix.lower() in (".npz", ".npy"):
         arrays = read_arrays(path)
-        is_alone = path.suffix.lower() == ".npy"
-        return intrinsics_from({"K": arrays["matrix"]} if is_alone else arrays, str(path))
+        is_matrix = path.suffix.lower() == ".npy"
+        return intrinsics_from({"K": arrays["matrix"]} if is_matrix else arrays, str(path))
     if path.suffix.lower() in (".txt", ".csv"):
         numbers = re.split(r"[\s,;]+", read_text(path).strip())
         if len(numbers) in (9, 13, 14, 17) and all(map(is_number, numbers)):

@@ -122,12 +122,16 @@ def matched(first: Keys, second: Keys) -> Match | None:
             np.zeros(0, int),
             False,
         )
-        for (a, keys), (b, their) in product(first.found[how].items(), second.found[how].items()):
+        for (a, keys), (b, other_keys) in product(
+            first.found[how].items(), second.found[how].items()
+        ):
             is_time = how == HOW[2]
-            rows, is_equal = (_nearest(keys, their), True) if is_time else _equal(keys, their)
+            rows, is_equal = (
+                (_nearest(keys, other_keys), True) if is_time else _equal(keys, other_keys)
+            )
             common, is_same = int((rows >= 0).sum()), a == b
             # Columns of different names have some numbers in common by chance.
-            is_sure = is_same or how != HOW[1] or any(len(str(key)) > 4 for key in their)
+            is_sure = is_same or how != HOW[1] or any(len(str(key)) > 4 for key in other_keys)
             fits = common == fewest or (2 * common > fewest and is_sure)
             if fits and (common, is_equal, is_same) > best[0]:
                 best = (common, is_equal, is_same), rows, is_sure
@@ -136,16 +140,16 @@ def matched(first: Keys, second: Keys) -> Match | None:
     return Match(HOW[3], np.arange(first.count)) if first.count == second.count else None
 
 
-def _equal(keys: Sequence[object], their: Sequence[object]) -> tuple[IntArray, bool]:
+def _equal(keys: Sequence[object], other_keys: Sequence[object]) -> tuple[IntArray, bool]:
     """(n,) the other's row of each key, -1 for none, and whether the keys are equal.
 
     Numbers of two counts of the same rows, one begun later, are the same.
     """
-    place = {key: at for at, key in enumerate(their) if key not in ("", None)}
+    place = {key: at for at, key in enumerate(other_keys) if key not in ("", None)}
     whole = [key for key in keys if isinstance(key, int)]
     others = [key for key in place if isinstance(key, int)]
     by = 0
-    if len(whole) == len(others) == len(keys) == len(their):
+    if len(whole) == len(others) == len(keys) == len(other_keys):
         steps = {b - a for a, b in zip(sorted(whole), sorted(others), strict=True)}
         by = steps.pop() if len(steps) == 1 else 0
     if by:

@@ -28,7 +28,7 @@ ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R
 
 
 def poses_from(
-    fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: Side
+    fields: Fields, names: Sequence[str], requested: PoseImportOptions, side: Side
 ) -> tuple[PoseNumbers, tuple[str, ...], Unstated]:
     """Reads the poses of the `robot` or `camera` from fields: (poses, notes, what is assumed).
 
@@ -37,7 +37,7 @@ def poses_from(
     position of three numbers and a rotation, ordered as names such as rvec and tvec show. Raises
     DataError.
     """
-    if whose == "robot":
+    if side == "robot":
         requested = _stated_form(fields, names, requested)
     if not requested.names and len(names) == 7 and requested.rotation == "quaternion-wxyz":
         # --form refers to the columns in their order in the file, and these were found by their
@@ -52,9 +52,9 @@ def poses_from(
         rotation = "matrix"
         requested = _by_rows(requested, sum(sizes))
     else:
-        positions, rotations, of_rotation = split_pose(fields, names, blocks, whose)
+        positions, rotations, of_rotation = split_pose(fields, names, blocks, side)
         rotation, doubt = _likely_rotation(
-            rotations, of_rotation, requested, whose, degrees=bool(units & {*DEGREES})
+            rotations, of_rotation, requested, side, degrees=bool(units & {*DEGREES})
         )
         notes += [doubt] * bool(doubt)
         unstated |= {"angles"} if requested.form is None and rotations.shape[1] == 3 else set()
@@ -69,8 +69,8 @@ def poses_from(
         unit, farthest = ("mm" if is_far else None), np.nanmax(np.abs(positions), initial=0.0)
         words = f"millimetres, as {farthest:.0f} m is far," if unit else "metres,"
         notes.append(
-            f"The {whose}'s positions are taken for {words} as the source does not say; "
-            f"--{whose}-unit names another unit."
+            f"The {side}'s positions are taken for {words} as the source does not say; "
+            f"--{side}-unit names another unit."
         )
     reading = replace(requested, unit=unit).reading(Reading(rotation))
     numbers = PoseNumbers(positions, rotations, reading, fields.places)
@@ -123,7 +123,7 @@ def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
 
 
 def check_radians(
-    poses: PoseNumbers, requested: PoseImportOptions, whose: str, *, guesses: bool = True
+    poses: PoseNumbers, requested: PoseImportOptions, side: str, *, guesses: bool = True
 ) -> None:
     """Checks that angles of unstated unit can be radians; raises DataError.
 
@@ -145,14 +145,14 @@ def check_radians(
         if form.models and form.rotation.endswith("-deg"):
             makers[form.words.partition("Z, ")[2]].append(form.name)
     listed = (f"{' or '.join(forms)} for {names}" for names, forms in makers.items())
-    next_step = f"Give --{whose}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
+    next_step = f"Give --{side}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
     if requested.form is not None:
         needed = f"poses of the form {requested.form} are in radians"
         degrees = f"{rotation.removesuffix('-rad')}-deg"
         degrees = f"{requested.form}-deg" if f"{requested.form}-deg" in POSE_FORMS else degrees
-        next_step = f"Give --{whose}-form {degrees}, where these are degrees"
+        next_step = f"Give --{side}-form {degrees}, where these are degrees"
     raise DataError(
-        f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
+        f"{poses.places[row]}: the {side}'s rotation has an angle of {largest[row]:.4g}, "
         f"{size}, and {needed}.",
         culprits=[poses.places[row]],
         next_step=next_step + ("; or let --guess find it." if guesses else "."),
@@ -163,7 +163,7 @@ def _likely_rotation(
     rotations: FloatArray,
     names: Sequence[str],
     requested: PoseImportOptions,
-    whose: Side,
+    side: Side,
     *,
     degrees: bool,
 ) -> tuple[str, str]:
@@ -182,35 +182,33 @@ def _likely_rotation(
         if is_mapping or requested.form is not None or is_abb or ends in ("xyzw", "wxyz"):
             return "quaternion-xyzw" if is_mapping else rotation, ""
         return rotation, (
-            f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
-            f"--{whose}-form quaternion-wxyz names the other order."
+            f"The {side}'s quaternions are taken for x, y, z, w, as the source does not say; "
+            f"--{side}-form quaternion-wxyz names the other order."
         )
     joined = " ".join(names).lower()
     largest = float(np.nanmax(np.abs(rotations), initial=0.0))
     if len(names) == 3 and [name[-2:].lower() for name in names] == ["qx", "qy", "qz"]:
         return "quaternion-xyz", (
-            f"The {whose}'s rotations have no qw, which is taken for the positive root of "
+            f"The {side}'s rotations have no qw, which is taken for the positive root of "
             "1 - qx² - qy² - qz²."
         )
     if _ANGLES_NAME.search(joined):
         is_large = not degrees and largest > 2 * np.pi + 0.01 and requested.form is None
-        note = (
-            f"The {whose}'s angles up to {largest:.0f} are no radians, and are taken for degrees."
-        )
+        note = f"The {side}'s angles up to {largest:.0f} are no radians, and are taken for degrees."
         return f"euler-xyz-{'deg' if degrees or is_large else 'rad'}", note * is_large
     if degrees:
         # Angle units are checked later, unless the user states them.
         return "rotation-vector-deg", ""
     if requested.form is None and not re.search(r"rvec|rot\w*vec", joined):
         return "rotation-vector", (
-            f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
-            f"radians, as the source does not say; --{whose}-form names another form."
+            f"The {side}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
+            f"radians, as the source does not say; --{side}-form names another form."
         )
     return "rotation-vector", ""
 
 
 def split_pose(
-    fields: Fields, names: Sequence[str], blocks: Sequence[FloatArray], whose: Side
+    fields: Fields, names: Sequence[str], blocks: Sequence[FloatArray], side: Side
 ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """Positions, rotations, and the names of the rotations' fields; raises DataError."""
     flat, sizes = np.hstack(blocks), [block.shape[1] for block in blocks]
@@ -233,7 +231,7 @@ def split_pose(
             "16 or 12 (matrix), 7 (quaternion) or 6 (three angles). There are "
             f"{fields.listing()}.",
             culprits=list(names),
-            next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
+            next_step=f"Name the fields of the {side}'s poses with --{side}-"
             f"{named_by(fields.places[0])}."
             + " What only moves, as a gantry, or only turns, as a gimbal about a fixed point, has "
             "zeros for the other three: add these columns." * (sum(sizes) == 3),

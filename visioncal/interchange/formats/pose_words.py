@@ -99,9 +99,9 @@ class PoseFields:
         sizes = [[fields.column(name).shape[1] for name in each] for each in (self.names, names)]
         return sizes[0] == sizes[1]
 
-    def is_reversed(self, whose: str) -> bool:
+    def is_reversed(self, side: str) -> bool:
         """Whether the words name the frames of a side in the order of the inverse pose."""
-        parent, child = FRAMES[whose]
+        parent, child = FRAMES[side]
         frames = [word for word in self.words if word in parent | child]
         if not ({*frames} & parent and {*frames} & child):
             return False

@@ -288,8 +288,8 @@ def _real_part(
     parent = names[0].rpartition(".")[0]
     vectors = [fields.numbers[name] for name in names]
     for name, numbers in fields.numbers.items():
-        is_own = name.rpartition(".")[0] == parent and {*words} <= {*words_of(name)}
-        if name in taken or numbers.ndim > 1 or not is_own:
+        is_component = name.rpartition(".")[0] == parent and {*words} <= {*words_of(name)}
+        if name in taken or numbers.ndim > 1 or not is_component:
             continue
         if appearance(np.stack([*vectors, numbers], axis=1)) == "quaternion":
             return (name,)
@@ -325,7 +325,7 @@ def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, st
 def pose_names(
     fields: Fields,
     given: Sequence[str],
-    whose: str,
+    side: str,
     taken: Collection[str],
     *,
     by_shape: bool = True,
@@ -342,8 +342,8 @@ def pose_names(
             for item in possible_poses(fields):
                 if f".{given[0]}." in f".{item.names[0]}.":
                     return item.names
-        return tuple(_of_side(fields, name, whose) for name in given)
-    first = next(iter(ranked_poses(fields, whose, taken, by_shape=by_shape)), [])
+        return tuple(_of_side(fields, name, side) for name in given)
+    first = next(iter(ranked_poses(fields, side, taken, by_shape=by_shape)), [])
     if first:
         return first[0].names if len(first) == 1 or _are_one(fields, first) else ()
     # A field whose rows are irregular is refused by its row.
@@ -356,18 +356,18 @@ def pose_names(
         (
             item.names
             for item in ragged
-            if item.sides == [whose] and not _NO_POSE.search(item.names[0].lower())
+            if item.sides == [side] and not _NO_POSE.search(item.names[0].lower())
         ),
         (),
     )
 
 
-def _of_side(fields: Fields, name: str, whose: str) -> str:
+def _of_side(fields: Fields, name: str, side: str) -> str:
     """The full name of a field; of equal ones in several files, that in the side's own."""
     known = dict.fromkeys([*fields.numbers, *fields.texts])
     candidates = [word for word in known if word.endswith(f".{name}") and name not in known]
     candidates = [
-        word for word in candidates if PoseFields((word,), tuple(words_of(word))).sides == [whose]
+        word for word in candidates if PoseFields((word,), tuple(words_of(word))).sides == [side]
     ]
     return candidates[0] if len(candidates) == 1 else fields.find(name)
 
@@ -397,22 +397,22 @@ def without_copies(fields: Fields, items: Sequence[PoseFields]) -> Sequence[Pose
 
 
 def ranked_poses(
-    fields: Fields, whose: str, taken: Collection[str] = (), *, by_shape: bool = True
+    fields: Fields, side: str, taken: Collection[str] = (), *, by_shape: bool = True
 ) -> list[list[PoseFields]]:
     """Fields that may hold the poses of the `robot` or `camera`, in groups, the likeliest first."""
     groups: dict[tuple[int, bool], list[PoseFields]] = defaultdict(list)
     # Those of frames of that side come first.
     possible = without_copies(fields, possible_poses(fields, taken, by_shape=by_shape))
-    for item in sorted(possible, key=lambda item: item.sides != [whose]):
-        is_own, is_plain = item.sides == [whose], not item.sides
+    for item in sorted(possible, key=lambda item: item.sides != [side]):
+        is_of_side, is_plain = item.sides == [side], not item.sides
         fits = (
-            is_own and item.is_named and not item.is_reversed(whose),
-            is_own and item.is_named,
-            is_plain and item.is_named and not item.is_seen and whose == "robot",
-            item.is_seen and item.is_named and whose == "camera",
-            (is_own or (is_plain and not item.is_seen)) and whose == "robot",
-            len(item.sides) > 1 and whose == "robot",
-            item.is_seen and whose == "robot",
+            is_of_side and item.is_named and not item.is_reversed(side),
+            is_of_side and item.is_named,
+            is_plain and item.is_named and not item.is_seen and side == "robot",
+            item.is_seen and item.is_named and side == "camera",
+            (is_of_side or (is_plain and not item.is_seen)) and side == "robot",
+            len(item.sides) > 1 and side == "robot",
+            item.is_seen and side == "robot",
         )
         if any(fits):
             groups[fits.index(True), bool({*item.words} & _ASKED_FOR)].append(item)

@@ -149,11 +149,11 @@ def convert(
     )
     for mend, values in of_views:
         session = session if values is None else mend(session, *values)
-    for mend_whole, is_asked in (
+    for mend_whole, is_requested in (
         (without_stated_lenses, is_session and requested == _FREE_LENSES),
         (without_reported_poses, mends.by_joints),
     ):
-        session = mend_whole(session) if is_asked else session
+        session = mend_whole(session) if is_requested else session
     if mends.mend_images:
         session = mend_images(session, requested.progress)
     write_session(session, dest)
@@ -188,7 +188,7 @@ def _reread(
             next_step="Write its rotations as qx, qy, qz, qw, or add views that show a target.",
         )
     left = map(robot_words, refused)
-    notes = [f"Poses of {whose} stay as they are: no reading stands out." for whose in left]
+    notes = [f"Poses of {label} stay as they are: no reading stands out." for label in left]
     if not reread_robots:
         notes.append("The poses of each robot that enough views test fit as first read.")
     return replace(doubtful.session, warnings=(*doubtful.session.warnings, *notes))

@@ -124,12 +124,12 @@ def applied_reading(
     best, declared = guess.best.hypothesis, guess.declared.hypothesis
     numbers = {"robot": foreign.robot, "camera": foreign.camera}
     fits = (best.mount, best.order) == (declared.mount, declared.order)
-    for whose in ("robot", "camera"):
-        found, stated = getattr(best, whose), getattr(declared, whose)
+    for side in ("robot", "camera"):
+        found, stated = getattr(best, side), getattr(declared, side)
         # Images are the same whatever the size of their board, of which calibrating tells.
         if found == stated or (is_measured and replace(found, scale=1.0) == stated):
             continue
-        free = foreign.unstated.get(whose, frozenset())
+        free = foreign.unstated.get(side, frozenset())
         changed = {
             name for name in ("unit", "inverse") if getattr(found, name) != getattr(stated, name)
         }
@@ -138,8 +138,8 @@ def applied_reading(
         # Nine numbers do not show whether they are by rows.
         by_columns = found.transposed and found.rotation == "matrix" and "inverse" in free
         fits &= (found.reading is not None or by_columns) and not found.mirrored and changed <= may
-        old = numbers[whose]
-        numbers[whose] = None if old is None or not fits else found.corrected(old)
+        old = numbers[side]
+        numbers[side] = None if old is None or not fits else found.corrected(old)
     if not fits:
         return None
     # One unit of both sides scales the cell, which poses alone do not show.
@@ -340,12 +340,12 @@ def reread_robot(
         DataError: The reading changes more than this robot's poses.
     """
     session, robot = doubtful.session, of_robot.robot
-    whose = robot_words(robot)
+    label = robot_words(robot)
     _refuse_lost(candidate)
     _refuse_mirrored(candidate, mirrors_poses=mirrors_poses)
     if not candidate.is_of_robot:
         raise DataError(
-            f"The chain of {whose} closes with {candidate.words}, which changes more than the "
+            f"The chain of {label} closes with {candidate.words}, which changes more than the "
             "poses of this robot: nothing was written.",
             culprits=[candidate.words],
             next_step="Of several robots or cameras, correct the files by hand.",
@@ -363,7 +363,7 @@ def reread_robot(
         document["robot"] = table
     # Another form of the same numbers, which the columns show, is no change.
     is_other = bool(candidate.hypothesis.changes)
-    changes = (f"Poses of {whose} are read otherwise than at first: {words}.",) * is_other
+    changes = (f"Poses of {label} are read otherwise than at first: {words}.",) * is_other
     changed = session.with_content(
         document=noting(session, document, changes),
         cells=[[row[name] for name in session.columns] for row in cells],

@@ -366,8 +366,8 @@ def _untested(
     `fault` is what kept the images from being used. Else notes that nothing was tested.
     """
     other = fault.finding if isinstance(fault, OtherBoardError) else None
-    is_asked = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
-    if is_asked and other is not None and other.kind == "other_board":
+    needs_form = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
+    if needs_form and other is not None and other.kind == "other_board":
         raise DataError(
             other.words,
             culprits=["--target"],
@@ -381,30 +381,30 @@ def _untested(
         raise foreign.doubt
     is_armless = foreign.arm is None and foreign.robot_document is None
     is_armless &= foreign.joints_rad is not None and not foreign.robot.present.any()
-    if is_asked and is_armless:
+    if needs_form and is_armless:
         raise DataError(
             f"{foreign.name}: there are joint angles and no poses of the robot, and their arm is "
             "not stated.",
             culprits=["--robot-model"],
             next_step="Name the arm with --robot-model: a built-in robot, its .urdf or a DH table.",
         )
-    for whose, free in foreign.unstated.items():
+    for side, free in foreign.unstated.items():
         if "rotation" in free:
-            raise _unsaid(foreign, whose, why, fault)
+            raise _unsaid(foreign, side, why, fault)
     note = f"The form of the poses stays as first read: {why}."
     note += " Convert with --guess --yes to read them so." if why.startswith("With ") else ""
     return replace(foreign, notes=(*foreign.notes, note))
 
 
 def _unsaid(
-    foreign: ForeignRecording, whose: Side, why: str, fault: VisioncalError | None
+    foreign: ForeignRecording, side: Side, why: str, fault: VisioncalError | None
 ) -> DataError:
     """The error that a form of rotations is not stated, and why images do not determine it."""
     joints = (
         " Where the numbers are joint angles, name them with --joint-columns, and the arm with "
         "--robot-model."
     )
-    numbers = foreign.robot if whose == "robot" else foreign.camera
+    numbers = foreign.robot if side == "robot" else foreign.camera
     size = 0 if numbers is None else numbers.rotations.shape[1]
     forms = (
         "quaternion-xyzw, or quaternion-wxyz"
@@ -412,14 +412,14 @@ def _unsaid(
         else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or their maker, as kuka"
     )
     by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
-    if whose == "robot" and len(by_names) == 1:
+    if side == "robot" and len(by_names) == 1:
         forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
     if why.startswith("With "):
         joints += (
             " What else this reading changes is done to the session that is then written: "
             "visioncal convert SESSION NEW --guess --yes."
         )
-    unsaid = f"the form of the {whose}'s rotations is not stated"
+    unsaid = f"the form of the {side}'s rotations is not stated"
     # A fault of the images comes first: while it lasts, no form helps.
     words = f"{unsaid}, and nothing determines it: {why}"
     step = f"{_MOVE}say" if why.startswith((ONE_AXIS, _STILL)) else "Say"
@@ -435,6 +435,6 @@ def _unsaid(
         step = f"{fault.next_step} Else give".strip()
     return DataError(
         f"{foreign.name}: {words}.",
-        culprits=[*(fault.culprits if fault else ()), f"--{whose}-form"],
-        next_step=f"{step} --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
+        culprits=[*(fault.culprits if fault else ()), f"--{side}-form"],
+        next_step=f"{step} --{side}-form {forms}.{joints if side == 'robot' else ''}",
     )

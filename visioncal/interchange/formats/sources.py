@@ -399,8 +399,8 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         uneven = [item for item in others if _filled(fields, item, lengths) != filled]
         others = [item for item in others if item not in uneven]
         others = [item for item in others if item.sides] or others * (not source.images)
-        for whose, item in zip(("robot", "camera"), (robot, *others[:1]), strict=False):
-            options += [f"--{whose}-{named_by(fields.places[0])}", ",".join(item.names)]
+        for side, item in zip(("robot", "camera"), (robot, *others[:1]), strict=False):
+            options += [f"--{side}-{named_by(fields.places[0])}", ",".join(item.names)]
         step = _of_one_file(source, requested, robot.names)
         if not step and uneven and not (others or source.images):
             counts = [

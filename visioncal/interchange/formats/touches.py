@@ -91,13 +91,13 @@ def read_point_pairs(path: Path) -> tuple[TouchRows, NominalPoints] | None:
             culprits=[str(path)],
             next_step="Name the touches first, and the drawing's table with --cad.",
         )
-    ours, theirs = pairs.points
-    labels = tuple(map(str, range(len(ours))))
-    poses = np.full((len(ours), 4, 4), np.nan)
-    poses[:, :3, 3] = ours
-    kinds = ("point",) * len(ours)
+    robot_points, camera_points = pairs.points
+    labels = tuple(map(str, range(len(robot_points))))
+    poses = np.full((len(robot_points), 4, 4), np.nan)
+    poses[:, :3, 3] = robot_points
+    kinds = ("point",) * len(robot_points)
     rows = TouchRows(path.name, labels, pairs.places, poses, None, kinds, labels)
-    return rows, NominalPoints(path.name, labels, theirs, np.zeros(len(theirs)))
+    return rows, NominalPoints(path.name, labels, camera_points, np.zeros(len(camera_points)))
 
 
 def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], PoseNumbers] | None:

@@ -48,8 +48,8 @@ class Use:
     def is_like(self, others: Sequence["Use"]) -> bool:
         """Whether others have the same frames, or need none."""
         frames = np.concatenate([self.base, self.tool])
-        theirs = (np.concatenate([each.base, each.tool]) for each in others)
-        return self.literal.are_joints or all(np.array_equal(frames, each) for each in theirs)
+        other_frames = (np.concatenate([each.base, each.tool]) for each in others)
+        return self.literal.are_joints or all(np.array_equal(frames, each) for each in other_frames)
 
 
 @dataclass

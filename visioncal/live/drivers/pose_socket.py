@@ -145,8 +145,8 @@ class SocketArm:
     @property
     def invitation(self) -> str:
         """Words on the address that listens, and on the robot's programs."""
-        is_own = self.host == "localhost" or self.host.startswith("127.")
-        who = "Programs of this computer alone" if is_own else "All computers that reach this one"
+        is_local = self.host == "localhost" or self.host.startswith("127.")
+        who = "Programs of this computer alone" if is_local else "All computers that reach this one"
         return (
             f"Waiting for the robot's own program at {self.host}:{self.port}. {who} can send "
             "poses; the first that says where it stands is heard until it hangs up. Programs for "

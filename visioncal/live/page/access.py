@@ -142,12 +142,12 @@ class Admission:
             return Response("The request is broken.", 400)
         is_known = match[1].rstrip(".") in self._hosts or (self._invite and address_of(match[1]))
         page_origin = f"http://{host}"
-        is_own = by.get("origin", "" if is_socket else page_origin) in (
+        is_same_origin = by.get("origin", "" if is_socket else page_origin) in (
             page_origin,
             f"https://{host}",
         )
         fetched = by.get("sec-fetch-site"), by.get("sec-fetch-mode") == "navigate"
-        if not is_known or not is_own or fetched == ("cross-site", False):
+        if not is_known or not is_same_origin or fetched == ("cross-site", False):
             return Response("Not from here.", 403)
         if not self._invite or _same(request.cookies.get(self._name, ""), self._cookie):
             return None

@@ -204,8 +204,8 @@ class Station:
     @_request
     def again(self, _: Visitor, number: int | None) -> None:
         """Lets the next view replace one, which stays until then; None for none."""
-        is_there = any(view.number == number for view in self._capture.journal.views)
-        self._publish(again=number if is_there else None)
+        is_listed = any(view.number == number for view in self._capture.journal.views)
+        self._publish(again=number if is_listed else None)
 
     @_request
     def choose(self, _: Visitor, name: str, *, leaves_out: bool = False) -> None:

@@ -60,5 +60,5 @@ class RowMotion(Effect):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """(k, 4, c) of the values at the moments' stops."""
         del distances
-        is_own = moments.stops[:, None] == self.stops
-        return np.asarray(np.kron(is_own, np.eye(4)).reshape(len(is_own), 4, -1))
+        is_at_stop = moments.stops[:, None] == self.stops
+        return np.asarray(np.kron(is_at_stop, np.eye(4)).reshape(len(is_at_stop), 4, -1))

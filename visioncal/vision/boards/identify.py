@@ -340,8 +340,8 @@ class _Grid:
         sides = np.stack(
             [px[:, 1] + px[:, 2] - px[:, 0] - px[:, 3], px[:, 2:].sum(1) - px[:, :2].sum(1)]
         )
-        own_from_px = 2.0 * np.linalg.pinv(np.moveaxis(sides, 0, -1))
-        steps = np.einsum("iab,ijb->ija", own_from_px, centres - centres[:, None])
+        marker_from_px = 2.0 * np.linalg.pinv(np.moveaxis(sides, 0, -1))
+        steps = np.einsum("iab,ijb->ija", marker_from_px, centres - centres[:, None])
         lengths = np.abs(steps).max(axis=2) + np.diag(np.full(len(rows), np.inf))
         # The nearest marker is one step away, where it is read.
         unit = max(float(np.quantile(lengths.min(axis=1), 0.25)), 1e-9)

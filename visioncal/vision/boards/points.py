@@ -246,8 +246,8 @@ def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, 
     counts = Counter(pairs)
     for tag, corner in pairs:
         if tag not in range(markers) or corner not in range(4):
-            given_here = f"a table with tag {tag}, corner {corner}"
-            raise table.refuse("points", given_here, f"tags 0 to {markers - 1}, corners 0 to 3")
+            wrong = f"a table with tag {tag}, corner {corner}"
+            raise table.refuse("points", wrong, f"tags 0 to {markers - 1}, corners 0 to 3")
         if counts[tag, corner] > 1:
             twice = f"a table with corner {corner} of tag {tag} twice"
             raise table.refuse("points", twice, "each corner once")

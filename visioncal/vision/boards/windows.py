@@ -52,11 +52,11 @@ class Windows:
         on_board, neighbours, smoother, axis = maps_about(board, px, good, chosen, axis)
         axes = np.eye(2) if pattern.axes is None else pattern.axes[chosen]
 
-        def on_own(places: FloatArray) -> FloatArray:
+        def on_window(places: FloatArray) -> FloatArray:
             return np.asarray(on_board(places) @ np.swapaxes(axes, -1, -2))
 
         start = px[chosen]
-        ends = on_own(start[:, None] + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
+        ends = on_window(start[:, None] + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
         jacobian_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
         jacobian = np.asarray(np.linalg.inv(jacobian_px), float)
         side_px = np.sqrt(np.abs(np.linalg.det(jacobian)))
@@ -79,7 +79,7 @@ class Windows:
         interpolation = np.vander(steps / reach, _NODES) @ np.linalg.inv(np.vander(nodes, _NODES))
         interpolation = interpolation.astype(np.float32)
         grid = np.stack(np.meshgrid(reach * nodes, reach * nodes), axis=-1).reshape(-1, 2)
-        values = on_own(centre[:, None] + grid).reshape(-1, _NODES, _NODES, 2).astype(np.float32)
+        values = on_window(centre[:, None] + grid).reshape(-1, _NODES, _NODES, 2).astype(np.float32)
         x, y = (
             np.asarray(interpolation @ values[..., axis] @ interpolation.T, np.float32)
             for axis in (0, 1)
