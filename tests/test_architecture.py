@@ -72,10 +72,12 @@ def test_the_listing_is_the_architecture():
 
 def test_packages_import_only_from_those_before():
     for path in modules():
-        own = package_of(path)
-        if own in LAYERS:
-            later = set(LAYERS[LAYERS.index(own) + 1 :])
-            wrong = {value for value in packages_imported(path) & later if (own, value) not in LAZY}
+        package = package_of(path)
+        if package in LAYERS:
+            later = set(LAYERS[LAYERS.index(package) + 1 :])
+            wrong = {
+                value for value in packages_imported(path) & later if (package, value) not in LAZY
+            }
             assert not wrong, (path, wrong)
 
 

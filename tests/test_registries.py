@@ -260,5 +260,5 @@ def test_an_entry_that_is_left_out_is_found():
     assert len([*effect_faults({k: v for k, v in EFFECTS.items() if k != "play"}, [])]) == 1
     assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="no-such")])]) == 1
     text = page(".github/CONTRIBUTING.md")
-    for there in ("`STAGES`", "`marker.py`", "`_axes`", "`tests/cli/test_cli.py`"):
-        assert len([*contributing_faults(text.replace(there, f"`absent{there[1:]}"))]) == 1
+    for entry in ("`STAGES`", "`marker.py`", "`_axes`", "`tests/cli/test_cli.py`"):
+        assert len([*contributing_faults(text.replace(entry, f"`absent{entry[1:]}"))]) == 1

@@ -47,17 +47,17 @@ def test_threads_write_what_one_alone_writes(tmp_path):
         write_outputs(tmp_path / str(number), session, found)
         return tmp_path / str(number)
 
-    alone = written(threads, Barrier(1))
+    single = written(threads, Barrier(1))
     before = settings()
     barrier = Barrier(threads)
     with ThreadPoolExecutor(threads) as pool:
         folders = list(pool.map(lambda number: written(number, barrier), range(threads)))
     assert settings() == before
-    evidence = read_evidence(alone / "recording.rrd")
+    evidence = read_evidence(single / "recording.rrd")
     for folder in folders:
         for name in ("calibration.json", "report.html"):
             # The report's commands name the folder.
-            texts = [(of / name).read_text("utf-8").replace(str(of), "") for of in (folder, alone)]
+            texts = [(of / name).read_text("utf-8").replace(str(of), "") for of in (folder, single)]
             assert texts[0] == texts[1]
         assert_same_evidence(read_evidence(folder / "recording.rrd"), evidence)
 
@@ -65,18 +65,18 @@ def test_threads_write_what_one_alone_writes(tmp_path):
 @pytest.mark.slow
 def test_threads_change_no_digit(tmp_path, monkeypatch):
     write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
-    asked = []
+    counts = []
 
     class Pool(ThreadPoolExecutor):
         def __init__(self, threads):
-            asked.append(threads)
+            counts.append(threads)
             super().__init__(threads)
 
     monkeypatch.setattr(concurrent.futures, "ThreadPoolExecutor", Pool)
     one, three = (
         replace(calibrate(tmp_path / "cell", threads=name), created=CREATED) for name in (1, 3)
     )
-    assert asked == [1, 3]
+    assert counts == [1, 3]
     assert to_document(one) == to_document(three)
     raised(DataError, "but must be at least 1", calibrate, tmp_path / "cell", threads=0)
 

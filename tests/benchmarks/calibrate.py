@@ -117,15 +117,15 @@ def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[
         options = replace(options, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)
     session = write_session(simulate(options), folder / f"{ending}_{level}")
     files, board = sorted((session / "images").iterdir()), charuco_board(options.target)
-    asked = "hand-eye" if level == "hand-eye" else "auto"
+    requested = "hand-eye" if level == "hand-eye" else "auto"
     rows = []
     for threads in few(THREADS, THREADS[:1]):
         command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out")]
-        command += ["--threads", str(threads), "--level", asked]
+        command += ["--threads", str(threads), "--level", requested]
         times = medians(
             lambda command=command: of_program(command),
             lambda threads=threads: seconds(
-                lambda: visioncal.calibrate(session, level=asked, threads=threads)
+                lambda: visioncal.calibrate(session, level=requested, threads=threads)
             ),
             lambda threads=threads: seconds(lambda: opencv_alone(files, board, threads)),
         )

@@ -48,11 +48,15 @@ class Checkout:
     def ask(self, **job: Any) -> dict[str, Any]:
         """Has a job done: its status, output and processor time."""
         if self.process is None or self.process.poll() is not None:
-            own = {"PYTHONPATH": str(self.folder), "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "300"}
+            env = {
+                "PYTHONPATH": str(self.folder),
+                "OPENBLAS_NUM_THREADS": "1",
+                "COLUMNS": "300",
+            }
             if self.options:
-                own["PYTHONPATH"] += os.pathsep + str(Path(__file__).parents[1])
+                env["PYTHONPATH"] += os.pathsep + str(Path(__file__).parents[1])
             self.process = subprocess.Popen(
-                [self.python, "-P", str(WORKER), *self.options], env=os.environ | own, text=True,
+                [self.python, "-P", str(WORKER), *self.options], env=os.environ | env, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             )  # fmt: skip
         into, out = self.process.stdin, self.process.stdout
@@ -105,18 +109,18 @@ class Lane:
                                     for name, checkout in sides})  # fmt: skip
 
 
-def compared(asked: argparse.Namespace, names: Sequence[str], folder: Path) -> list[Pair]:
+def compared(arguments: argparse.Namespace, names: Sequence[str], folder: Path) -> list[Pair]:
     """All pairs that there is time for."""
     every: Iterable[tuple[str, int]] = (
         (name, seed)
-        for seed in (range(asked.seeds) if asked.seeds else itertools.count())
+        for seed in (range(arguments.seeds) if arguments.seeds else itertools.count())
         for name in names
     )
-    until, rest, pairs, done = time.monotonic() + 60.0 * asked.minutes, iter(every), [], set()
+    until, rest, pairs, done = time.monotonic() + 60.0 * arguments.minutes, iter(every), [], set()
 
     def work() -> None:
-        lane = Lane(asked.before, asked.after)
-        while asked.seeds or time.monotonic() < until:
+        lane = Lane(arguments.before, arguments.after)
+        while arguments.seeds or time.monotonic() < until:
             with Lane.writing:
                 # Worlds that have no more sessions leave the rest to others.
                 left = set(names) - done
@@ -131,8 +135,8 @@ def compared(asked: argparse.Namespace, names: Sequence[str], folder: Path) -> l
         for checkout in lane.checkouts:
             checkout.end()
 
-    with ThreadPoolExecutor(asked.lanes) as pool:
-        for lane in [pool.submit(work) for _ in range(asked.lanes)]:
+    with ThreadPoolExecutor(arguments.lanes) as pool:
+        for lane in [pool.submit(work) for _ in range(arguments.lanes)]:
             lane.result()
     return sorted(pairs, key=lambda pair: (pair.world, pair.seed))
 
@@ -148,16 +152,16 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=2, help="processes of each checkout")
     parser.add_argument("--keep", type=Path, help="a folder for sessions and results")
     parser.add_argument("--quick", action="store_true")
-    asked = parser.parse_args()
-    names = [name for name in WORLDS if name.startswith(tuple(asked.worlds))]
-    if asked.quick:
-        asked.seeds, names = 1, names[:2]
+    arguments = parser.parse_args()
+    names = [name for name in WORLDS if name.startswith(tuple(arguments.worlds))]
+    if arguments.quick:
+        arguments.seeds, names = 1, names[:2]
     if not names:
         sys.exit(f"no world begins so; there are: {', '.join(WORLDS)}")
-    with tempfile.TemporaryDirectory() as beside:
-        folder = asked.keep or Path(beside)
-        pairs = compared(asked, names, folder)
-        if asked.keep:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.keep or Path(temporary)
+        pairs = compared(arguments, names, folder)
+        if arguments.keep:
             (folder / "pairs.json").write_text(json.dumps([asdict(pair) for pair in pairs]))
     text, odd = report(pairs)
     print(text)

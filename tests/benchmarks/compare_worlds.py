@@ -95,9 +95,9 @@ class Command:
 def ended(reply: Mapping[str, Any], cause: str) -> Outcome:
     """The outcome without a result."""
     status = {2: "refused", -1: "late"}.get(reply["status"], "bug")
-    told = json.loads(reply["out"])["error"]["class"] if status == "refused" else ""
-    right = bool(re.search(cause, told)) if cause else None
-    return Outcome(status, told, reply["seconds"], is_right=right)
+    error_class = json.loads(reply["out"])["error"]["class"] if status == "refused" else ""
+    right = bool(re.search(cause, error_class)) if cause else None
+    return Outcome(status, error_class, reply["seconds"], is_right=right)
 
 
 def errors(document: Mapping[str, Any], truth: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def rms(rows: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(np.atleast_2d(rows) ** 2, axis=1))))
 
 
-def own(options: CellOptions, cause: str = "", *, workspace: bool = False):
+def simple(options: CellOptions, cause: str = "", *, workspace: bool = False):
     """A simulated cell of one robot and one camera, as corners; mounts and lenses by turns."""
 
     def write(seed: int, folder: Path) -> Made:
@@ -163,11 +163,11 @@ def foreign(name: str):
         true_ray = case.reported_x[:3, :3] @ Rotation.from_rotvec(ray).apply([0.0, 0.0, 1.0])
 
         def judge(document, out, ask):
-            told = [{"px": look.px.tolist(), "point": look.point.tolist(),
+            rows = [{"px": look.px.tolist(), "point": look.point.tolist(),
                      "normal": look.normal.tolist(),
                      "pose": look.reported.tolist() if case.mount == MOUNTS[0] else None}
                     for look in looks]  # fmt: skip
-            places = ask(do="located", calibration=str(out / "calibration.json"), looks=told)["out"]
+            places = ask(do="located", calibration=str(out / "calibration.json"), looks=rows)["out"]
             away, squares = [], []
             for look, (place, covariance) in zip(looks, places, strict=True):
                 axes = np.linalg.svd(look.normal[None])[2][1:]
@@ -278,9 +278,9 @@ def misread(kind: str):
     def write(seed: int, folder: Path) -> Made:
         cell, rng = some_cell(seed), np.random.default_rng(seed)
         seen = mistakes.sound(cell.robot.base_from_flange, cell.cam_from_target, cell.options.mount)
-        told = mistakes.MISTAKES[kind](seen, rng)
-        robot, camera = told.robot.poses(), told.camera.poses()
-        return Made(posed(folder / "session", told.mount, robot, camera),
+        mistaken = mistakes.MISTAKES[kind](seen, rng)
+        robot, camera = mistaken.robot.poses(), mistaken.camera.poses()
+        return Made(posed(folder / "session", mistaken.mount, robot, camera),
                     cause="misread|exchanged|swapped|unit|DataError")  # fmt: skip
 
     return write
@@ -438,17 +438,17 @@ _FINE, _ARM = kept_answers._FINE, kept_answers._WRONG_ARM
 _OFF = (RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3), RobotAt("b", (0.6, 0.05, 0.02)))
 WORLDS: Mapping[str, Callable[[int, Path], Made | Command | None]] = {
     "real": real,
-    "own: good robot": own(_FINE),
-    "own: coarse robot": own(replace(_FINE, robot_sigma_m=3e-4, robot_sigma_rad=5e-4)),
-    "own: 6 views": own(replace(_FINE, views=6)),
-    "own: two boards": own(replace(_FINE, views=24, second=kept_answers._SHELF)),
-    "own: 3 wrong views": own(replace(_FINE, wrong_views=3), "wrong_views|exchanged|misread"),
-    "own: lens 1 px off": own(replace(_FINE, lens_mismatch_px=1.0), "lens|camera|intrinsics"),
-    "own: board 0.5 % larger": own(replace(_FINE, board_scale=1.005), "board|size|scale"),
-    "arms: 0.3 mm, 0.3 mrad": own(_ARM, workspace=True),
-    "arms: zeros 1 mrad": own(replace(_FINE, views=30, offset_sigma_rad=1e-3, branches=True),
+    "own: good robot": simple(_FINE),
+    "own: coarse robot": simple(replace(_FINE, robot_sigma_m=3e-4, robot_sigma_rad=5e-4)),
+    "own: 6 views": simple(replace(_FINE, views=6)),
+    "own: two boards": simple(replace(_FINE, views=24, second=kept_answers._SHELF)),
+    "own: 3 wrong views": simple(replace(_FINE, wrong_views=3), "wrong_views|exchanged|misread"),
+    "own: lens 1 px off": simple(replace(_FINE, lens_mismatch_px=1.0), "lens|camera|intrinsics"),
+    "own: board 0.5 % larger": simple(replace(_FINE, board_scale=1.005), "board|size|scale"),
+    "arms: 0.3 mm, 0.3 mrad": simple(_ARM, workspace=True),
+    "arms: zeros 1 mrad": simple(replace(_FINE, views=30, offset_sigma_rad=1e-3, branches=True),
                               workspace=True),
-    "arms: springs": own(replace(_ARM, views=60, compliance_rad_per_nm=kept_answers._SPRINGS),
+    "arms: springs": simple(replace(_ARM, views=60, compliance_rad_per_nm=kept_answers._SPRINGS),
                          workspace=True),
     **{f"elsewhere: {name}": foreign(name) for name in elsewhere.WORLDS},
     "cells: sound": network(),

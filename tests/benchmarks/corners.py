@@ -104,14 +104,14 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
     if not core:
         return None
     best = min(errors.values(), key=lambda error: rms(np.concatenate(error)))
-    both = (best, core)
+    methods = (best, core)
     return Row(
         words,
         shot,
         len(left),
-        *(rms(np.concatenate(group)) for group in both),
-        tuple(rms([each.mean(axis=0) for each in group]) for group in both),
-        tuple(far(np.concatenate(group)) for group in both),
+        *(rms(np.concatenate(group)) for group in methods),
+        tuple(rms([each.mean(axis=0) for each in group]) for group in methods),
+        tuple(far(np.concatenate(group)) for group in methods),
         float(np.mean(left)),
         rms(np.concatenate(scaled)) ** 2,
     )
@@ -157,11 +157,11 @@ def table(rows: list[Row]) -> str:
     head += "| shared px | outliers | not fitted | NEES |"
     lines = [head, "| ---: | ---: | ---: | --- |" + " ---: |" * 8]
     for row in rows:
-        shot, (bias, own), (out, few_out) = row.shot, row.bias_px, row.outliers
+        shot, (bias, core_bias), (out, few_out) = row.shot, row.bias_px, row.outliers
         lines.append(
             f"| {shot.square_px:.0f} | {shot.disc_px:.0f} | {shot.noise:.0f} | {row.words} "
             f"| {row.corners} | {row.peer_px:.4f} | {row.core_px:.4f} | {row.ratio:.2f} "
-            f"| {bias:.4f}, {own:.4f} | {out:.1%}, {few_out:.1%} | {row.left:.1%} "
+            f"| {bias:.4f}, {core_bias:.4f} | {out:.1%}, {few_out:.1%} | {row.left:.1%} "
             f"| {row.nees:.2f} |"
         )
     ratios = [row.ratio for row in rows]

@@ -499,15 +499,15 @@ def looks_of(case: Case, seed: int) -> list[Look]:
     rng, world = np.random.default_rng([seed, 43]), case.world
     base, looks, robots = case.frames[0], [], []
     for board in views_of(LOOKS, rng):
-        there = board @ np.array([*(WINDOW_M / 2), 0.0, 1.0])
+        point = board @ np.array([*(WINDOW_M / 2), 0.0, 1.0])
         noise = rng.normal(size=6)
         error = pose(world.robot_rad * noise[:3], world.robot_m * noise[3:])
         robots.append(case.flanges(board))
         camera = base @ (robots[-1] @ case.x if case.mount == "eye-in-hand" else case.x)
         far = board[2:3, 3] / case.mean_m
         focal = float(world.focus(far, rng)[0]) if world.focus else 1.0
-        px = seen(there[None, :3], case.shift, focal)[0] + world.pixel_px * rng.normal(size=2)
-        looks.append(Look(px, (camera @ there)[:3], camera[:3, 2], error))
+        px = seen(point[None, :3], case.shift, focal)[0] + world.pixel_px * rng.normal(size=2)
+        looks.append(Look(px, (camera @ point)[:3], camera[:3, 2], error))
     try:
         reported = case.reported_of(np.array(robots))
     except RuntimeError:  # Other looks instead of those that the arm does not reach.

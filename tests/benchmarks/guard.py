@@ -221,8 +221,11 @@ def knows(cell, looked, name, mm, rng):
     scores = {}
     for kind, columns in kinds.items():
         chosen = list(columns)
-        own, sigma = information[np.ix_(chosen, chosen)], scale[chosen]
-        inner, scaled = np.eye(len(chosen)) + own * np.outer(sigma, sigma), sigma * gradient[chosen]
+        block, sigma = information[np.ix_(chosen, chosen)], scale[chosen]
+        inner, scaled = (
+            np.eye(len(chosen)) + block * np.outer(sigma, sigma),
+            sigma * gradient[chosen],
+        )
         count = joints if kind.startswith("joint") else 1
         scores[kind] = (0.5 * scaled @ np.linalg.solve(inner, scaled)
                         - 0.5 * np.linalg.slogdet(inner)[1] - np.log(count))  # fmt: skip
@@ -249,13 +252,13 @@ def speed():
 def rows_of(found):
     """The table's rows of faults."""
     for fault, mm in dict.fromkeys(row[:2] for row in found):
-        mine = [row[2:] for row in found if row[:2] == (fault, mm)]
-        shown = [row[2:] for row in mine if row[2] is not None]
+        fault_rows = [row[2:] for row in found if row[:2] == (fault, mm)]
+        shown = [row[2:] for row in fault_rows if row[2] is not None]
         right, best = (f"{100 * np.mean([row[at] for row in shown]):.0f} %" for at in (0, 1))
         size = f"{np.median([row[2] for row in shown if row[0]] or [0.0]):.2g} mm"
         name = "creeping camera, a week" if fault == "creep" else fault
         what = f"{2 * mm:.2g} mrad" if fault == "joint" else f"{mm:g} mm"
-        delay, known = (f"{np.mean([row[at] for row in mine]):.1f}" for at in (0, 1))
+        delay, known = (f"{np.mean([row[at] for row in fault_rows]):.1f}" for at in (0, 1))
         yield [name, what, delay, known, *(
             ["", "", "", ""] if fault == "creep" else
             [f"{len(shown)}", right, best, size if fault != "joint" else ""])]  # fmt: skip

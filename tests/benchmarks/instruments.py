@@ -59,8 +59,10 @@ def planning(seeds):
                 @ forward(shop.true_arm, unseen)
                 @ shop.flange_from_probe
             )
-            told = invert(edges[0]) @ found.calibrated_robot.base_from_flange(unseen) @ edges[1]
-            off = 1e3 * np.linalg.norm((true - told)[:, :3, 3], axis=1)
+            predicted = (
+                invert(edges[0]) @ found.calibrated_robot.base_from_flange(unseen) @ edges[1]
+            )
+            off = 1e3 * np.linalg.norm((true - predicted)[:, :3, 3], axis=1)
             row += [found.arm.levels[0].rms_mm, found.rms.mm, float(np.sqrt(np.mean(off**2)))]
         rows.append(row)
     of = np.sqrt(np.mean(np.square(rows), axis=0))
@@ -85,10 +87,10 @@ def loads(seeds):
     ):
         off, wide = [], []
         for seed in range(seeds):
-            mine = replace(options, seed=seed, **changes)
-            unloaded = calibrate(session_of(tracked(mine)))
+            drawn = replace(options, seed=seed, **changes)
+            unloaded = calibrate(session_of(tracked(drawn)))
             result = calibrate_loaded(
-                session_of(tracked(replace(mine, payloads=forces), flat)), unloaded
+                session_of(tracked(replace(drawn, payloads=forces), flat)), unloaded
             )
             springs = result.elastic.joints[1:3]
             sigmas = np.array([spring.sigma_rad_per_nm for spring in springs])
@@ -105,8 +107,10 @@ def loads(seeds):
         q = np.repeat(
             random_postures(arm_named(ARM), 20, np.random.default_rng(100 + seed)), 2, axis=0
         )
-        mine = replace(options, seed=seed, weight_compensated=True, payloads=(Payload(), forces[2]))
-        result = calibrate(session_of(tracked(mine, q)))
+        drawn = replace(
+            options, seed=seed, weight_compensated=True, payloads=(Payload(), forces[2])
+        )
+        result = calibrate(session_of(tracked(drawn, q)))
         chosen += result.elastic is not None and result.elastic.weight.startswith("compensated")
         spring = result.elastic.joints[1]
         off.append(abs(spring.compliance_rad_per_nm - 1 / STIFF[1]) / spring.sigma_rad_per_nm)

@@ -50,15 +50,15 @@ def main() -> None:
             served(*words, "--camera", f"folder:{folder / 'inbox'}") as (url, process),
             opened(browser, url) as page,
         ):
-            told = psutil.Process(process.pid)
+            server = psutil.Process(process.pid)
 
             def timed(what: str, act, shown) -> None:
-                tried = is_trying(told)
+                tried = is_trying(server)
                 begun = time.perf_counter()
                 act()
                 shown()
                 taken = time.perf_counter() - begun
-                if tried == is_trying(told):
+                if tried == is_trying(server):
                     seconds[what, tried].append(taken)
 
             pose = page.get_by_label("Pose of the flange")

@@ -52,16 +52,16 @@ def picks_mm(cell, change, kind, seed, calibration, taught, moved=STILL):
         look, pick = cell.robot.joints[rng.integers(len(cell.robot.joints), size=2)]
         at_board = np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(-0.2, 0.0), 1.0])
         if kind == "moved base":
-            there, found = true_z @ at_board, moved[0] @ taught @ at_board
+            target, found = true_z @ at_board, moved[0] @ taught @ at_board
         else:
             looks_from = cell.robot.flange_at((look + change.joints_rad)[None])[0] @ true_x
-            there = z @ at_board
-            seen = invert(looks_from) @ there
+            target = z @ at_board
+            seen = invert(looks_from) @ target
             found = arm.real.base_from_flange(look[None])[0] @ x_found @ seen
         turn = arm.real.base_from_flange(pick[None])[0][:3, :3]
         sent = correct(arm, compose(turn, found[:3] - turn @ tip), pick)
         stands = cell.robot.flange_at(sent.q + change.joints_rad)[0]
-        miss = stands[:3, :3] @ true_tip + stands[:3, 3] - there[:3]
+        miss = stands[:3, :3] @ true_tip + stands[:3, 3] - target[:3]
         misses.append(1e3 * np.linalg.norm(miss) if sent.reached[0] else np.nan)
     return np.array(misses)
 
@@ -88,8 +88,8 @@ def recovered_cell(kind, seed, counts, arm):
         after = picks_mm(cell, change, kind, seed, new, taught, moved)
         driven = pairwise(stops.robot.joints)
         driven_s = 1.5 * count + sum(travel_s(CaptureOptions(), *pair) for pair in driven)
-        alone, passed = causes_found(check) == (side,), new.verdict.status != "bad"
-        rows.append((after, (driven_s + computed_s) / 60.0, side in named, alone, passed))
+        is_sole, passed = causes_found(check) == (side,), new.verdict.status != "bad"
+        rows.append((after, (driven_s + computed_s) / 60.0, side in named, is_sole, passed))
     return before, without, rows
 
 
@@ -108,11 +108,11 @@ def main():
                 rms.append(np.sqrt(np.mean(kept**2, axis=1)))
             rms, facts = np.array(rms), np.array([rows[at][1:] for _, _, rows in found])
             before, without, after = np.sqrt(np.mean(rms**2, axis=0))
-            named, alone, passed = facts[:, 1:].sum(axis=0).astype(int)
+            named, sole, passed = facts[:, 1:].sum(axis=0).astype(int)
             lines.append(
                 f"| {words} | {kind} | {count} | {before:.3f} | {without:.1f} | {after:.3f} | "
                 f"{after / before:.2f} | {(rms[:, 2] / rms[:, 0]).max():.2f} | "
-                f"{named} ({alone}) of {cells} | {passed} of {cells} | {facts[:, 0].max():.1f} |"
+                f"{named} ({sole}) of {cells} | {passed} of {cells} | {facts[:, 0].max():.1f} |"
             )
             print(lines[-1], flush=True)
     text = (

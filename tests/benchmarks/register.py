@@ -103,7 +103,7 @@ class Ways:
         self.deg[way].append(float(np.rad2deg(turn)))
         self.mm[way].append(1e3 * float(np.linalg.norm(((pose - truth) @ middle)[:3])))
 
-    def told(self, way: str, views: int) -> str:
+    def figures(self, way: str, views: int) -> str:
         """Medians, and in how many views it gave nothing."""
         found = self.mm[way]
         if not found:
@@ -117,7 +117,7 @@ def made(row: Row, seed: int) -> tuple[Image, Target, Print]:
     """A print's picture, its target and what is registered."""
     if row.kind != "charuco":
         picture = PICTURES[row.kind](seed)
-        told = {
+        document = {
             "kind": "picture",
             "width_m": row.width_m,
             # As sure as the ChArUco board's, which it stands beside.
@@ -127,7 +127,7 @@ def made(row: Row, seed: int) -> tuple[Image, Target, Print]:
         flat = Print(
             np.asarray(picture / 255, np.float32), row.width_m / picture.shape[1], np.zeros(2)
         )
-        return picture, target_from_document(told, row.kind), flat
+        return picture, target_from_document(document, row.kind), flat
     square_m = row.width_m / row.columns
     rows = {9: 6, 6: 4}[row.columns]
     marker_m = 0.75 * square_m
@@ -284,12 +284,12 @@ def measured(row: Row, views: int) -> Ways:
             if pose is not None:
                 ways.add("opencv", pose, truth, middle)
         begun = time.thread_time()
-        own = find_target(image, target)
+        corners = find_target(image, target)
         ways.seconds["find"].append(time.thread_time() - begun)
-        if isinstance(own, DetectedCorners):
-            places = corner_positions(target)[own.ids]
+        if isinstance(corners, DetectedCorners):
+            places = corner_positions(target)[corners.ids]
             for way, camera in (("own", CAMERA), ("own, lens off", wrong)):
-                pose = by_points(places, own.px, camera)
+                pose = by_points(places, corners.px, camera)
                 if pose is not None:
                     ways.add(way, pose, truth, middle)
         pose = by_ecc(image, row, picture, paper(row), start)
@@ -317,16 +317,16 @@ def lines(rows: Sequence[Row], views: int) -> Iterator[str]:
     yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
     for row in rows:
         ways = measured(row, views)
-        told = [ways.told(way, views) for way in ("opencv", "own", "ecc", "registered")]
+        figures = [ways.figures(way, views) for way in ("opencv", "own", "ecc", "registered")]
         ratios = []
         for way in ("registered", "registered, lens off"):
             values = ways.squared[way] or [np.nan]
             ratios.append(f"{np.mean(values):.2f}, {np.median(values):.2f}")
-        off = [ways.told(way, views) for way in ("own, lens off", "registered, lens off")]
+        off = [ways.figures(way, views) for way in ("own, lens off", "registered, lens off")]
         took = [f"{np.median(ways.seconds[way]):.2f}" for way in ("find", "registered")]
         yield (
             f"| {row.words} | "
-            + " | ".join([*told, ratios[0], *off, ratios[1], ", ".join(took)])
+            + " | ".join([*figures, ratios[0], *off, ratios[1], ", ".join(took)])
             + " |"
         )
 

@@ -51,8 +51,8 @@ def write_section(name: str, command: str, text: str) -> None:
 def _machine() -> str:
     packages = (("numpy", "numpy"), ("OpenCV", "opencv-contrib-python-headless"))
     versions = ", ".join(f"{label} {version(package)}" for label, package in packages)
-    told = ["git", "describe", "--always", "--dirty", "--exclude=*"]
-    at = subprocess.run(told, cwd=RESULTS.parent, capture_output=True, text=True, check=False)
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    at = subprocess.run(command, cwd=RESULTS.parent, capture_output=True, text=True, check=False)
     commit = f"commit {at.stdout.strip()}, " if at.stdout else ""
     return (f"{commit}{datetime.date.today().isoformat()}, on {os.cpu_count()} cores with Python "
             f"{platform.python_version()}, {versions}.")  # fmt: skip

@@ -52,8 +52,8 @@ def shifted(pair: Pair, rng: np.random.Generator) -> Pair:
         start, by = 0, int(rng.choice([2, 3]))
     rows = np.arange(len(robot))
     moved = np.where(rows >= start, rows + by, rows)
-    there = moved < len(rows)
-    return robot[there], boards[moved[there]]
+    is_within = moved < len(rows)
+    return robot[is_within], boards[moved[is_within]]
 
 
 def turned(pair: Pair, rng: np.random.Generator) -> Pair:

@@ -147,8 +147,8 @@ def test_images_and_measured_poses_are_calibrated_in_one_session(session_copy, d
     evidence = {view.view: view for view in done[0].evidence}
 
     def measured(at, row):
-        told = pose_row(evidence[at].cam_from_target)
-        cells = {f"cft_{name}": repr(value) if at < 3 else "" for name, value in told.items()}
+        cam_pose = pose_row(evidence[at].cam_from_target)
+        cells = {f"cft_{name}": repr(value) if at < 3 else "" for name, value in cam_pose.items()}
         return row | cells | {"image": "" if at < 3 else row["image"]}
 
     rewritten(session_copy, measured)
@@ -160,9 +160,9 @@ def test_images_and_measured_poses_are_calibrated_in_one_session(session_copy, d
 
 
 def test_progress_is_reported_and_the_same_session_gives_the_same_numbers(rendered, done):
-    found, told = done
-    assert ("detect", 12, 12) in told
-    assert {"pnp", "solve", "examine", "judge"} <= {stage for stage, *_ in told}
+    found, reports = done
+    assert ("detect", 12, 12) in reports
+    assert {"pnp", "solve", "examine", "judge"} <= {stage for stage, *_ in reports}
     again = to_document(visioncal.calibrate(Session.load(rendered)))
     assert again | {"created": ""} == to_document(found.calibration) | {"created": ""}
     raised(DataError, r"solver is text .'best'", visioncal.calibrate, rendered, solver="best")
@@ -251,8 +251,8 @@ def test_two_views_and_no_board_are_refused(rendered):
 @pytest.fixture(scope="module")
 def done(rendered):
     """The run of a rendered session, and what was told of its progress."""
-    told = []
-    return run(rendered, progress=lambda *report: told.append(report)), told
+    reports = []
+    return run(rendered, progress=lambda *report: reports.append(report)), reports
 
 
 # Where the finding comes from: poses, files, images, motion. All others are kept answers.

@@ -116,8 +116,8 @@ def three():
 
 def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean):
     _, found = clean
-    there, back = found.between("cam_left", "base_b"), found.between("base_b", "cam_left")
-    np.testing.assert_allclose(there.matrix @ back.matrix, np.eye(4), atol=1e-12)
+    forth, back = found.between("cam_left", "base_b"), found.between("base_b", "cam_left")
+    np.testing.assert_allclose(forth.matrix @ back.matrix, np.eye(4), atol=1e-12)
     assert not found.between("base_a", "base_a").covariance.any()
     ends = ("cam_left", "target_plate_b")
     poses = {"b": exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, 0.6]))}
@@ -153,8 +153,8 @@ def test_cameras_that_have_each_others_images_from_a_stop_on_are_no_moves():
     assert found[0].startswith("From stop 20 on, or up to there, cam_top and cam_side have each")
     assert found[1].startswith("target_floor moved between stops 19 and 20, by 1900 mm")
     # A camera that came near to another's place is moved.
-    alone = [finding.words for finding in moved_findings(moves[:2], edges)]
-    assert alone[0].startswith("cam_top was bumped between stops 19 and 20")
+    first_words = [finding.words for finding in moved_findings(moves[:2], edges)]
+    assert first_words[0].startswith("cam_top was bumped between stops 19 and 20")
 
 
 def test_the_joint_covariance_is_in_the_order_of_the_transforms_where_a_frame_moved():
@@ -524,10 +524,10 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         assert kinematics.level == "offsets"
         true = real.true_arm.offset - real.arm.offset
         zeros = [value for value in kinematics.parameters if value.name == "theta_rad"]
-        told = np.array([zero.change for zero in zeros])
+        changes = np.array([zero.change for zero in zeros])
         # Others than the first and the last are known to some 0.05 mrad by this many stops.
-        assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
-        surprises = (told - true) / [zero.sigma for zero in zeros]
+        assert changes[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
+        surprises = (changes - true) / [zero.sigma for zero in zeros]
         assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
         one, q = found.of("cam_left", robot, f"target_plate_{robot}"), real.joints
         poses = kinematics.robot.base_from_flange(q)
@@ -570,9 +570,9 @@ def test_a_camera_that_one_standing_view_ties_is_refused():
 
 @pytest.mark.slow
 def test_a_camera_that_a_board_ties_either_way_round_is_refused():
-    beside = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
+    neighbour = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
     boards = (replace(FLOOR, target=ALIKE), BoardAt("plate_a", "a"))
-    cell = simulate(NetworkOptions(ROBOTS[:1], cameras=(LEFT, beside), boards=boards, stops=12))
+    cell = simulate(NetworkOptions(ROBOTS[:1], cameras=(LEFT, neighbour), boards=boards, stops=12))
     kept = [sight for sight in cell.sights if (sight.camera, sight.board) != ("right", "plate_a")]
     with pytest.raises(DegenerateError, match="cam_right may be in two places: target_floor looks"):
         solved(replace(cell, sights=tuple(kept)))
@@ -587,13 +587,13 @@ def turned(tilt_deg, stops=14, noise=1.0, turn_deg=35.0, prior=None):
     flanges = [pose(*pair) for pair in zip(angles, places, strict=True)]
     cell.flanges["b"] = np.linalg.inv(cell.truth["base_b"]) @ np.array(flanges)
     problem = observed(cell, rng, noise=noise)
-    seen, rows, told = problem.observations, [], set()
+    seen, rows, stated = problem.observations, [], set()
     for at, (camera, target, stop) in enumerate(cell.pairs):
         row = {"view": at, "stop": stop, "camera": camera[4:], "target": target[7:]}
         # Each robot's pose stands once a stop.
         robot = {"target_a": "a", "target_b": "b"}.get(target)
-        fresh = robot is not None and (robot, stop) not in told
-        told.add((robot, stop))
+        fresh = robot is not None and (robot, stop) not in stated
+        stated.add((robot, stop))
         row["robot"] = robot if fresh else ""
         row |= pose_row(problem.poses[robot][stop]) if fresh else dict.fromkeys(POSE, "")
         row |= {f"cft_{name}": value for name, value in pose_row(seen.measured[at]).items()}

@@ -104,8 +104,8 @@ def test_a_stated_offset_is_compared(session):
     right = clocked_of(stating(session, AHEAD_S + 1e-3))
     assert not any("is stated as" in warning.words for warning in right.warnings)
     wrong = calibrate(stating(session, 0.0))
-    told = "camera_minus_robot_s is stated as +0.00 ms, but the motion gives +37.2"
-    assert any(told in reason for reason in wrong.verdict.reasons)
+    words = "camera_minus_robot_s is stated as +0.00 ms, but the motion gives +37.2"
+    assert any(words in reason for reason in wrong.verdict.reasons)
     assert wrong.verdict.status == "check"
     assert wrong.clock.stated_s == 0.0
     assert abs(wrong.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
@@ -133,8 +133,8 @@ def dwelling(ahead_s: float, at_rest: int = 20) -> Session:
     stop, phase_s = np.divmod(times_s, 2.2)
     share = np.clip(phase_s - 1.2, 0.0, 1.0)
     share = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
-    here = stop.astype(int)
-    joints = q[here] + share * (q[np.minimum(here + 1, len(q) - 1)] - q[here])
+    index = stop.astype(int)
+    joints = q[index] + share * (q[np.minimum(index + 1, len(q) - 1)] - q[index])
     stamps = 2.2 * stops + np.where(stops < at_rest, 0.6, 1.3) + ahead_s
     return streamed((stamps, measured_poses(cell)), (times_s, forward(cell.robot.arm, joints)))
 
@@ -375,16 +375,16 @@ def test_motion_that_does_not_determine_the_offset_is_refused_unless_it_is_state
     assert (clocked.clock.method, clocked.clock.sigma_s) == ("stated", 1e-3)
     assert "is taken as stated, +20 ms, to 1 ms" in clocked.warnings[0].words
     view = clocked.views[0]
-    there = exp((view.stamp_s - 0.02) * SCREW)
-    np.testing.assert_allclose(view.base_from_flange().as_matrix(), there, atol=1e-9)
+    expected = exp((view.stamp_s - 0.02) * SCREW)
+    np.testing.assert_allclose(view.base_from_flange().as_matrix(), expected, atol=1e-9)
     np.testing.assert_allclose(clocked.speeds[view.number], SCREW, atol=1e-7)
 
 
 def test_times_in_another_unit_and_times_that_are_missing_are_named(session):
     for per_s, apart_s in ((1e3, 8), (1e6, 8000)):
-        both = with_robot_stamps(session, lambda s, by=per_s: by * s)
+        scaled = with_robot_stamps(session, lambda s, by=per_s: by * s)
         words = rf"streams/robot\.csv: by stamp_s its samples are {apart_s} s apart; .* in seconds"
-        raised(DataError, words, calibrate, restamped(both, lambda s, by=per_s: by * s))
+        raised(DataError, words, calibrate, restamped(scaled, lambda s, by=per_s: by * s))
     rows = [{k: v for k, v in view.numbers.items() if k != "stamp_s"} for view in session.views]
     raised(DataError, "where a stream has the poses, stamp_s", calibrate, with_rows(session, rows))
 

@@ -53,8 +53,8 @@ def pairs(seed, mount, views=18, step=None, farther_m=0.0):
         turn = np.linalg.multi_dot(exp(turns)[:, :3, :3])
         middle = np.array([*(away * rng.uniform([-0.12, -0.08], [0.12, 0.08])), away])
         camera = compose(turn, middle - turn @ PLACES.mean(axis=0))
-        there = camera if step is None or len(seen) < 9 else camera @ exp(np.array(step))
-        px = (PLACES @ there[:3, :3].T + there[:3, 3]) @ LENS.T
+        seen_pose = camera if step is None or len(seen) < 9 else camera @ exp(np.array(step))
+        px = (PLACES @ seen_pose[:3, :3].T + seen_pose[:3, 3]) @ LENS.T
         px = px[:, :2] / px[:, 2:]
         if ((px < 5.0) | (px > [1275.0, 715.0])).any():
             continue
@@ -113,8 +113,8 @@ def test_a_cause_is_sure_where_its_cure_leaves_noise():
     assert "Applied and refitted, it leaves noise of" in cause.without_it
     # Beside another step about as likely, which its sentence names, it is the likeliest.
     (step,) = known.assessment.steps
-    both = replace(known.assessment, steps=(step, step))
-    assert judge(findings_of(replace(known, assessment_or_none=both))).causes[0].by_limit
+    two_steps = replace(known.assessment, steps=(step, step))
+    assert judge(findings_of(replace(known, assessment_or_none=two_steps))).causes[0].by_limit
     # Nor beside corners that show another lens from there on.
     lens = Finding("focus", "The lens changed at once.", mahalanobis_sq=2.0 * cause.mahalanobis_sq)
     (moved, _) = contested(known, [cause, lens])
@@ -152,11 +152,11 @@ def test_an_arm_on_its_way_at_some_stops_is_named(by, share, words):
     """At every third stop; a tool moves along lines, and turns about one axis."""
     cell = simulate(CellOptions(seed=4, views=24, robot_sigma_m=2e-5, robot_sigma_rad=5e-5))
     robot, stops = cell.robot.base_from_flange.copy(), np.arange(2, 23, 3)
-    here, there = cell.robot.base_from_flange[stops], cell.robot.base_from_flange[stops + by]
-    turns = Rotation.from_matrix(invert(here)[:, :3, :3] @ there[:, :3, :3]).as_rotvec()
+    poses, others = cell.robot.base_from_flange[stops], cell.robot.base_from_flange[stops + by]
+    turns = Rotation.from_matrix(invert(poses)[:, :3, :3] @ others[:, :3, :3]).as_rotvec()
     # The picture is taken where the cell has the arm: what is logged is off that.
-    robot[stops, :3, :3] = here[:, :3, :3] @ Rotation.from_rotvec(-share * turns).as_matrix()
-    robot[stops, :3, 3] -= share * (there - here)[:, :3, 3]
+    robot[stops, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(-share * turns).as_matrix()
+    robot[stops, :3, 3] -= share * (others - poses)[:, :3, 3]
     verdict = calibrated(reporting(cell, base_from_flange=robot), joints=False).verdict
     cause = verdict.causes[0]
     assert cause.kind == "something_moved"
@@ -206,8 +206,8 @@ def test_a_camera_that_slowly_turns_is_no_lens_that_surely_changed(seed):
     (cause, *_) = calibrated(reporting(cell, base_from_flange=flange)).verdict.causes
     assert cause.by_limit
     # The truth may be named alone, where no lens does about as well, and stands beside a lens.
-    truth, beside = "The load on the flange crept", "as these views leave it open: what the flange"
-    assert cause.words.startswith(truth) or f"{beside} carries crept" in cause.words
+    truth, rival = "The load on the flange crept", "as these views leave it open: what the flange"
+    assert cause.words.startswith(truth) or f"{rival} carries crept" in cause.words
 
 
 @pytest.mark.slow

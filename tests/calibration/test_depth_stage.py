@@ -237,7 +237,7 @@ def by_another_camera(session):
     """The session with the same plane's distances by a depth camera of another lens, beside."""
     lens = replace(SMALL, resolution=(424, 240), matrix=np.array([300.0, 300.0, 211.5, 119.5]),
                    distortion=np.zeros(5))  # fmt: skip
-    beside = compose(
+    cam_from_depth = compose(
         exp(np.array([0.01, -0.03, 0.005, 0, 0, 0]))[:3, :3], np.array([0.05, 0.004, -0.01])
     )
     cell = calibrated(1, "eye-in-hand", FALSE, 12)[0]
@@ -246,7 +246,7 @@ def by_another_camera(session):
     u, v = np.moveaxis((2 * px + 1) / lens.resolution - 1, -1, 0)
     rng, files = np.random.default_rng(0), {}
     for sight in cell.sights:
-        pose = np.linalg.inv(beside) @ sight.cam_from_target
+        pose = np.linalg.inv(cam_from_depth) @ sight.cam_from_target
         z = (pose[:3, 2] @ pose[:3, 3]) / (rays @ pose[:3, 2])
         measured = FALSE.scale * z + FALSE.offset_m + FALSE.bowl_m * (u**2 + (v * 240 / 424) ** 2)
         measured += 0.8e-3 * z**2 * rng.standard_normal(z.shape)
@@ -254,8 +254,8 @@ def by_another_camera(session):
         view = next(view for view in session.views if view.number == sight.view)
         files[view.depth] = cv2.imencode(".png", raw)[1].tobytes()
         files[view.image] = session.images.read(view.image)
-    turn = Rotation.from_matrix(beside[:3, :3]).as_quat().tolist()
-    x, y, z = beside[:3, 3].tolist()
+    turn = Rotation.from_matrix(cam_from_depth[:3, :3]).as_quat().tolist()
+    x, y, z = cam_from_depth[:3, 3].tolist()
     document = {
         **session.document,
         "cameras": {
@@ -271,12 +271,12 @@ def by_another_camera(session):
             }
         },
     }  # fmt: skip
-    return cell, beside, session.with_content(images=MemoryImages(files), document=document)
+    return cell, cam_from_depth, session.with_content(images=MemoryImages(files), document=document)
 
 
 def test_a_depth_camera_beside_has_its_own_lens_and_place(tmp_path):
     session, result = made()
-    cell, beside, other = by_another_camera(session)
+    cell, cam_from_depth, other = by_another_camera(session)
     assert not [words for words in other.warnings if "depth" in words]
     found, evidence = with_depth(without(result.calibration), result.evidence, other)
     depth = found.camera.depth
@@ -284,7 +284,7 @@ def test_a_depth_camera_beside_has_its_own_lens_and_place(tmp_path):
     # Chi-square of five exceeds this in one case of a thousand.
     assert error @ np.linalg.solve(depth.covariance, error) < 20.5
     stored = Calibration.from_json(found.text, "stored")
-    assert stored.camera.depth.by.cam_from_depth == pytest.approx(beside)
+    assert stored.camera.depth.by.cam_from_depth == pytest.approx(cam_from_depth)
     # Cells are shown where the image has them, on the board.
     cells = next(view.depth for view in evidence if view.depth is not None)
     assert np.abs(cells[:, 4]).mean() < 0.2 * np.abs(cells[:, 3]).mean()
@@ -390,8 +390,8 @@ def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
     calibration.save(tmp_path / "calibration.json")
     output = tmp_path / "base.npy"
     visioncal("locate", "-c", tmp_path, "--cloud", tmp_path / "cloud.npy", "-o", output).good()
-    there = np.load(output).reshape(-1, 3)
-    away = there[np.isfinite(there[:, 2]), 2] - 0.1
+    points = np.load(output).reshape(-1, 3)
+    away = points[np.isfinite(points[:, 2]), 2] - 0.1
     assert len(away) > 1000
     assert np.abs(np.median(away)) < 2e-4
     assert np.std(away) < 2e-4
@@ -400,7 +400,7 @@ def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
     ).good()
     again_there = read_cloud((tmp_path / "base.ply").read_bytes(), "base.ply")
     # Floats of the file.
-    assert again_there == pytest.approx(there[np.isfinite(there[:, 2])], abs=1e-6)
+    assert again_there == pytest.approx(points[np.isfinite(points[:, 2])], abs=1e-6)
     assert pose.shape == (4, 4)
 
 

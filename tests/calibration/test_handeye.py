@@ -125,8 +125,8 @@ def test_the_noise_of_pose_pairs_is_where_it_arises(of_flange, name, runs):
         noise = exp(rng.normal(0.0, [0.05] * 3 + [0.005] * 3, (24, 6)))
         flange = z @ invert(x @ cam_from_target)
         seen = cam_from_target if of_flange else cam_from_target @ noise
-        told = flange @ noise if of_flange else flange
-        found = visioncal.calibrate(pairs_session("eye-in-hand", told, seen))
+        reported = flange @ noise if of_flange else flange
+        found = visioncal.calibrate(pairs_session("eye-in-hand", reported, seen))
         assert {level.partition("_")[0] for level in found.noise} == {name}
         squares.append(misfit(found.edges["flange_from_cam"], x))
     # Chi-squares of six degrees of freedom each: exceeded in one case of a thousand.

@@ -260,14 +260,14 @@ def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():
     for view in session.views:
         seen = {f"cft_{name}": view.numbers[f"meas_{name}"] for name in POSE}
         views.append(replace(view, numbers=view.numbers | seen))
-    both = replace(
+    two_sides = replace(
         session,
         columns=(*session.columns, *(f"cft_{name}" for name in POSE)),
         views=tuple(views),
         document={**session.document, "mount": "eye-to-hand"},
     )
-    known = read(both)
-    assert both.mount == "eye-to-hand"
+    known = read(two_sides)
+    assert two_sides.mount == "eye-to-hand"
     assert known.readings is None
     words = "30 rows have an instrument's readings"
     assert any(words in warning.reason for warning in known.warnings)
@@ -374,11 +374,13 @@ def test_gears_of_two_slopes_are_found_under_heavy_loads(beyond, monkeypatch):
     )
     drawn = random_postures(arm_named(options.robot), 20, np.random.default_rng(100))
     found = calibrate(session_of(tracked(options, np.repeat(drawn, 3, axis=0))))
-    told = {at: spring.slopes for at, spring in enumerate(found.elastic.joints) if spring.slopes}
-    assert told.keys() == (knees.keys() if beyond < 1.0 else set())
+    found_slopes = {
+        at: spring.slopes for at, spring in enumerate(found.elastic.joints) if spring.slopes
+    }
+    assert found_slopes.keys() == (knees.keys() if beyond < 1.0 else set())
     words = " ".join(finding.words for finding in found.verdict.findings)
-    assert words.count("yields by two slopes") == len(told)
-    for joint, slopes in told.items():
+    assert words.count("yields by two slopes") == len(found_slopes)
+    for joint, slopes in found_slopes.items():
         assert slopes.knee_nm == pytest.approx(knees[joint], rel=0.15)
         first, second = 1.0 / stiff[joint], beyond / stiff[joint]
         assert abs(slopes.compliance_rad_per_nm - first) < 2.0 * slopes.sigma_rad_per_nm

@@ -478,8 +478,8 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     # Some write the side that the joints moved to; a dead-band is a width all the same.
     known = calibrated(reporting(cell, approach=way * cell.robot.approach))
     assert known.robot_arm.kinematics.level == "backlash"
-    told = [play.deadband_rad for play in arm_found(known).sections.arm.backlash]
-    assert told == pytest.approx(PLAY, abs=1.5e-4)
+    deadbands = [play.deadband_rad for play in arm_found(known).sections.arm.backlash]
+    assert deadbands == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
     q, result = known.robot_arm.joints_rad, result_of(known)
     stated = known.robot.base_from_flange(q)
@@ -529,8 +529,8 @@ def test_offsets_of_the_first_and_the_last_joint_are_never_determined(mount):
     assert advice == ""
     # Both sines of each encoder are determined, however the arm is mounted.
     data = arm_data(robot, postures(robot)[:60], mount, ("links", "eccentricity"))
-    both = identified(data)[0].observability
-    assert (both.identifiable, both.determined) == (42, 42)
+    two_sines = identified(data)[0].observability
+    assert (two_sines.identifiable, two_sines.determined) == (42, 42)
 
 
 def test_a_joint_that_hardly_moved_is_named():
@@ -558,9 +558,9 @@ def test_stops_are_planned_that_determine_springs():
     springs, rigid = (stop_factors(cell, PURPOSES[name], q) for name in ("elastic", "kinematics"))
     # One unknown a joint more; the upright first axis bears no weight, wherever the arm stands.
     assert springs.shape[2] == rigid.shape[2] + 6
-    told = np.abs(springs[:, :, -6:]).max(axis=(0, 1))
-    assert told[0] < 1e-6 * told[1]
-    assert told[1:5].min() > 0.0
+    largest = np.abs(springs[:, :, -6:]).max(axis=(0, 1))
+    assert largest[0] < 1e-6 * largest[1]
+    assert largest[1:5].min() > 0.0
     bare = replace(cell, robot=replace(cell.robot, masses=None))
     with pytest.raises(DataError, match="does not state the masses of its links"):
         stop_factors(bare, PURPOSES["elastic"], q)
@@ -578,9 +578,9 @@ def test_predictions_move_with_springs_as_their_derivatives_say():
 @pytest.mark.slow
 def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for():
     right = simulate(replace(GOOD, seed=3))
-    known, asked = calibrated(right), calibrated(right, level="kinematics")
-    assert known.robot_arm.kinematics.level == asked.robot_arm.kinematics.level == "nominal"
-    assert any("The arm stays as stated" in reason for reason in asked.verdict.reasons)
+    known, requested = calibrated(right), calibrated(right, level="kinematics")
+    assert known.robot_arm.kinematics.level == requested.robot_arm.kinematics.level == "nominal"
+    assert any("The arm stays as stated" in reason for reason in requested.verdict.reasons)
     # Of an arm that is off and does not bend.
     rigid = calibrated(simulate(replace(WRONG_LINKS, seed=3)), level="elastic")
     assert rigid.robot_arm.kinematics.level != "nominal"

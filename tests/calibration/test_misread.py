@@ -79,11 +79,13 @@ def is_named(guess: Guess, poses: Poses) -> bool:
     if not np.isclose(best.board_scale, poses.true_scale):
         return False
     found, true = best.hypothesis.robot_numbers(poses.robot).poses(), poses.true_robot
-    there = np.isfinite(true).all(axis=(1, 2))
+    is_known = np.isfinite(true).all(axis=(1, 2))
     turns = HALF_TURNS if best.hypothesis.robot.mirrored else HALF_TURNS[:1]
     # Numbers are rewritten without loss, but for the rounding of a few conversions.
     return any(
-        np.allclose(a @ found[there] @ b, true[there], atol=1e-7) for a in turns for b in turns
+        np.allclose(a @ found[is_known] @ b, true[is_known], atol=1e-7)
+        for a in turns
+        for b in turns
     )
 
 
@@ -248,8 +250,8 @@ def test_a_planted_mistake_is_named(make, mount, views):
 @pytest.mark.parametrize(("order", "mount"), [("xyz", MOUNTS[0]), ("ZYZ", MOUNTS[1])])
 def test_angles_in_degrees_that_lost_turns_are_named_and_not_made_up(tmp_path, mount, order):
     poses = cell_poses(mount)
-    told = misread(f"euler-{order}-deg", "m", Reading(f"euler-{order}-rad"))(poses)
-    robot = told.robot.poses()
+    mistaken = misread(f"euler-{order}-deg", "m", Reading(f"euler-{order}-rad"))(poses)
+    robot = mistaken.robot.poses()
     guess = guessed(replace(poses, robot=numbers(robot)))
     assert guess.stands_out
     # Angles about fixed axes are those about moving ones in reverse order.
@@ -267,11 +269,11 @@ def test_angles_in_degrees_that_lost_turns_are_named_and_not_made_up(tmp_path, m
 
 def test_both_sides_in_millimetres_and_inverse_poses_of_the_camera_are_read_right():
     poses = cell_poses()
-    camera, told = (
+    camera, reported = (
         numbers(side, unit="mm").read_as(Reading())
         for side in (poses.camera.poses(), poses.true_robot)
     )
-    guess = guess_reading(told, camera, poses.mount)
+    guess = guess_reading(reported, camera, poses.mount)
     best = guess.best.hypothesis
     assert guess.stands_out
     # It shows by where cameras can be.
@@ -360,8 +362,8 @@ def test_sound_poses_are_not_accused(world, mount):
 def test_the_advised_command_runs_as_printed_and_mends_the_session(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     planted = plant("the other mount", cell_poses())
-    told, seen = planted.robot.poses(), planted.camera.poses()
-    pairs_session(planted.mount, told, seen).save(Path("my cell"))
+    reported, seen = planted.robot.poses(), planted.camera.poses()
+    pairs_session(planted.mount, reported, seen).save(Path("my cell"))
     followed = follow("calibrate", "my cell", "-o", "out")
     assert [run.status for run in followed.runs] == [3, 0]
     assert printed_commands(followed.runs[0].said)[0] == (
@@ -426,14 +428,14 @@ def test_another_size_that_leaves_most_of_a_misfit_is_no_cause(seed):
 @pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])
 def test_poses_that_were_never_recorded_are_named(lost):
     poses = cell_poses()
-    told = poses.robot.poses()
+    reported = poses.robot.poses()
     if lost == "positions":
-        told[:, :3, 3] = 0.0
+        reported[:, :3, 3] = 0.0
     else:
-        told[:, :3, :3] = np.eye(3)
+        reported[:, :3, :3] = np.eye(3)
     if lost == "poses":
-        told[:] = told[0]
-    session = pairs_session(poses.mount, told, poses.camera.poses())
+        reported[:] = reported[0]
+    session = pairs_session(poses.mount, reported, poses.camera.poses())
     one_place = "all rows have one position of the robot"
     if lost == "positions":
         verdict = visioncal.calibrate(session).verdict
@@ -573,10 +575,10 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     assert found.verdict.status != "good"
     assert any("pi / 180" in reason for reason in found.verdict.reasons)
     assert "joint angles are misread" in found.views[3].reason
-    alone = visioncal.calibrate(replace(session, robot_document=None))
+    poses_only = visioncal.calibrate(replace(session, robot_document=None))
     # What is done with the poses is what would be done if there were no joints.
     for name, edge in found.edges.items():
-        np.testing.assert_array_equal(edge.matrix, alone.edges[name].matrix)
+        np.testing.assert_array_equal(edge.matrix, poses_only.edges[name].matrix)
     words = "needs the joint angles"
     error = raised(DataError, words, visioncal.calibrate, session, level="kinematics")
     assert "multiply q1_rad to q6_rad by pi / 180" in error.next_step
@@ -621,8 +623,8 @@ def test_one_row_of_wrong_joints_costs_its_view_alone():
 def test_joints_are_judged_by_their_fit():
     robot, joints = ROBOT, Q
 
-    def guess(told, q=joints, arm=robot):
-        return guess_joints(arm, told, arm.base_from_flange(q))
+    def guess(angles, q=joints, arm=robot):
+        return guess_joints(arm, angles, arm.base_from_flange(q))
 
     # Joints of many arms turn by two turns either way: these are no degrees.
     assert not guess(joints + 2.0 * np.pi * np.where(joints > 0.0, -1.0, 1.0)).stands_out
@@ -776,8 +778,8 @@ def test_a_shift_moves_the_joints(tmp_path, with_poses):
     }
     rows = [{name: value[at].tolist() for name, value in keyed.items()} for at in range(12)]
     (tmp_path / "log.json").write_text(json.dumps(rows))
-    asked = ImportOptions(mount="eye-in-hand", robot_model="ur5e")
-    foreign = read_foreign(tmp_path / "log.json", asked)
+    options = ImportOptions(mount="eye-in-hand", robot_model="ur5e")
+    foreign = read_foreign(tmp_path / "log.json", options)
     session = assemble(foreign)
     for recorded in (DoubtfulSession.of(foreign), DoubtfulSession(session)):
         guess = recorded.guess()

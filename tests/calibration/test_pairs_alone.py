@@ -68,8 +68,8 @@ def with_tool(folder: Path, is_active):
                 turn = Rotation.from_quat(numbers[3:])
                 place = numbers[:3] + turn.apply([0.01, 0.02, 0.15])
                 turn = turn * Rotation.from_euler("z", 30.0, degrees=True)
-                both = [*place.tolist(), *turn.as_quat().tolist()]
-                row |= dict(zip(POSE, map(repr, both), strict=True))
+                pose = [*place.tolist(), *turn.as_quat().tolist()]
+                row |= dict(zip(POSE, map(repr, pose), strict=True))
         return rows
 
     edit_rows(folder, change)

@@ -79,8 +79,10 @@ OF_HALF = CellOptions(robot="ur3e", views=24, camera=TWICE, pixel_sigma_px=0.03,
 def with_camera(cell, off_px=(0, 0, 0, 0), **table):
     """What the session says of the camera: a matrix that is off, and more fields."""
     stated = replace(cell.options.camera, matrix=cell.options.camera.matrix + off_px)
-    told = session_of(replace(cell, stated={"": stated}))
-    return replace(told, document=told.document | {"camera": told.document["camera"] | table})
+    session = session_of(replace(cell, stated={"": stated}))
+    return replace(
+        session, document=session.document | {"camera": session.document["camera"] | table}
+    )
 
 
 @pytest.mark.slow
@@ -98,9 +100,9 @@ def test_a_closed_form_is_diagnosed_too():
 
 def test_views_held_back_may_be_ambiguous():
     cell = simulate(AMBIGUOUS)
-    told = session_of(cell)
-    views = tuple(replace(view, holdout=view.number % 4 == 0) for view in told.views)
-    known = calibrated(cell, session=replace(told, views=views))
+    session = session_of(cell)
+    views = tuple(replace(view, holdout=view.number % 4 == 0) for view in session.views)
+    known = calibrated(cell, session=replace(session, views=views))
     assert any(len(known.poses[index].cam_from_target) > 1 for index in range(0, 20, 4))
     assert known.used == tuple(index for index in range(20) if index % 4)
     # Of the order of the used views': half a turn of the board would be metres.
@@ -110,8 +112,8 @@ def test_views_held_back_may_be_ambiguous():
 def test_a_session_that_holds_all_views_back_is_refused():
     for given in (True, False):
         cell = simulate(replace(FINE, views=8, state_intrinsics=given))
-        told = session_of(cell)
-        held = replace(told, views=tuple(replace(view, holdout=True) for view in told.views))
+        session = session_of(cell)
+        held = replace(session, views=tuple(replace(view, holdout=True) for view in session.views))
         caught = raised(DataError, "are held back", calibrated, cell, session=held)
         assert "Clear role" in caught.next_step
 
@@ -476,8 +478,10 @@ def test_sections_of_the_fit_are_read_back_as_written():
     prior, solved = CalibrationPrior.of(result_of(known)), known.assessment
     np.testing.assert_allclose(prior.state.edges, solved.fit.state.edges, atol=1e-12)
     # What lenses do beyond their models is not written.
-    own = np.delete(np.arange(len(solved.fit.whole)), solved.fit.unknowns.of_kinds("lens errors"))
-    covariance = solved.fit.whole[np.ix_(own, own)]
+    written = np.delete(
+        np.arange(len(solved.fit.whole)), solved.fit.unknowns.of_kinds("lens errors")
+    )
+    covariance = solved.fit.whole[np.ix_(written, written)]
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     # Slopes there and back undo each other up to rounding.
     np.testing.assert_allclose(prior.covariance / scale, covariance / scale, atol=1e-6)

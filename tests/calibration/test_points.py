@@ -280,13 +280,13 @@ def test_one_image_of_two_targets_is_two_views_and_rows_name_their_targets(tmp_p
     """A board, and the same board's corners as a rig of another size beside it, in one row."""
     aside = exp(np.array([0.0, 0.0, 0.5, 0.05, 0.02, 0.03]))
     points = corner_positions(CHARUCO) @ aside[:3, :3].T + aside[:3, 3]
-    both = replace(
+    rig = replace(
         CUBE,
         name="both",
         points_m=tuple(map(tuple, np.vstack([corner_positions(CHARUCO), points]).tolist())),
         point_numbers=tuple(range(80)),
     )
-    seen(both)[1].save(tmp_path / "cell")
+    seen(rig)[1].save(tmp_path / "cell")
     folder = tmp_path / "cell"
     (folder / "board.toml").write_text(tomli_w.dumps(target_document(CHARUCO)))
     text = (folder / "session.toml").read_text().replace('target = "target.toml"\n', "")
@@ -372,8 +372,8 @@ def test_numbers_that_turn_the_board_over_are_named(target, mount, words):
 
 def errors_px(found, truth):
     """The errors of corners that were found, of more than twenty of them."""
-    both, ours, theirs = np.intersect1d(found.ids, truth.ids, return_indices=True)
-    assert len(both) > 20
+    common, ours, theirs = np.intersect1d(found.ids, truth.ids, return_indices=True)
+    assert len(common) > 20
     return found.px[ours] - truth.px[theirs]
 
 

@@ -209,14 +209,14 @@ def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike():
     # Beside such a robot, corners are nearly exact.
     robots = tuple(replace(robot, robot_sigma_m=1e-4) for robot in options.robots)
     cell = simulate(replace(options, stops=14, boards=boards, robots=robots))
-    told = cell_session(cell, "repeated", seen="corners")
+    session = cell_session(cell, "repeated", seen="corners")
     # All views of the board on the floor by one camera have the same bias, as a detector has it.
     seen = [
         (sight.view, bent(sight.exact, SIGMA_PX) if sight.board == "floor" else sight.exact)
         for sight in cell.sights
     ]
     corners = table(seen, np.random.default_rng(8))
-    found = calibrate(replace(told, corner_table=corners))
+    found = calibrate(replace(session, corner_table=corners))
     for name, edge in found.edges.items():
         truth = cell.mountings[name.partition("_from_")[2]]
         if name.startswith("cell"):
@@ -263,7 +263,7 @@ def test_readings_of_one_stated_stop_are_no_copies_to_delete():
     assert reasons == {"read anew at its stop, which counts once"}
 
 
-def told(poses=None, joints=None, stops=None):
+def stated_session(poses=None, joints=None, stops=None):
     """A session of poses or joint angles or both, one row each."""
     views = []
     for at in range(len(CELL.robot.joints)):
@@ -279,7 +279,7 @@ def in_pairs(step, poses=True):
     """The cell's rows in pairs: the second of each is the first, changed by a step."""
     values = CELL.robot.base_from_flange if poses else CELL.robot.joints
     rows = [step(values[at - 1]) if at % 2 else values[at] for at in range(len(values))]
-    return told(**{"poses" if poses else "joints": rows}, stops=np.arange(8) // 2)
+    return stated_session(**{"poses" if poses else "joints": rows}, stops=np.arange(8) // 2)
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,7 @@ def test_rows_of_one_stop_may_be_read_anew_and_a_pose_beside_its_joints_is_named
     assert len(reported_poses(anew, ROBOT).base_from_flange) == 8
     poses = CELL.robot.base_from_flange.copy()
     poses[5] = poses[5] @ exp(0.3 * SIDEWAYS)
-    (found,) = reported_poses(told(poses, CELL.robot.joints), ROBOT).warnings
+    (found,) = reported_poses(stated_session(poses, CELL.robot.joints), ROBOT).warnings
     assert found.views == (5,)
     words = "Pose and joint angles disagree in view 5, by up to 300 mm and under 0.001 deg"
     assert found.words.startswith(words)

@@ -60,17 +60,17 @@ class Warmed:
 
 
 @cache
-def recorded(told: str) -> tuple[WarmUpOptions, SimulatedCell, Session]:
+def recorded(measured: str) -> tuple[WarmUpOptions, SimulatedCell, Session]:
     """A warm-up with temperatures or currents, and its session."""
-    how = WarmUpOptions(CELL, temperatures=told == "temperatures")
+    how = WarmUpOptions(CELL, temperatures=measured == "temperatures")
     truth = simulate_warm_up(how)
     return how, truth, cell_session(truth, "warm-up", seen="poses")
 
 
 @cache
-def learnt(told: str) -> Warmed:
+def learnt(measured: str) -> Warmed:
     """What is calibrated with it."""
-    (how, truth, session), temperatures = recorded(told), told == "temperatures"
+    (how, truth, session), temperatures = recorded(measured), measured == "temperatures"
     warming = how.warming()
     whole = session.with_streams({"heat": warming.recorded(temperatures=temperatures)})
     inputs = inputs_of(whole, truth.robot.joints.shape[1])
@@ -99,17 +99,17 @@ def model(kind="currents", tau_s=1800.0, gain=2.0):
 
 def inputs(kind="currents", hours=2.0, seed=0):
     stamps = np.arange(0.0, 3600.0 * hours, 40.0)
-    told = np.random.default_rng(seed).uniform(2.0, 9.0, (len(stamps), 6))
-    return Inputs(kind, stamps, told, 21.0 + np.sin(stamps / 3000.0))
+    values = np.random.default_rng(seed).uniform(2.0, 9.0, (len(stamps), 6))
+    return Inputs(kind, stamps, values, 21.0 + np.sin(stamps / 3000.0))
 
 
 # Over 8 worlds the median share was 0.10 and 0.18, the worst of each 0.14 and 0.34; this world is
 # not the worst. The limits are those that are promised of the median.
 @pytest.mark.slow
-@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
-def test_a_hundred_minutes_predict_five_hours(told, limit):
+@pytest.mark.parametrize(("measured", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
+def test_a_hundred_minutes_predict_five_hours(measured, limit):
     """All over the workspace, between the training and the fifth hour."""
-    found = learnt(told)
+    found = learnt(measured)
     arm, drift = found.truth.robot.true_arm, found.calibration.drift
     q = postures(load_robot(CELL.robot))[:PLACES]
     at_s = np.linspace(TRAINED_S, END_S, len(q))
@@ -291,8 +291,8 @@ def warming(change=lambda temperatures: temperatures, from_s=0.0):
     at_s = np.arange(0.0, 6000.0, 10.0)[:, None]
     rises = np.array([18.0, 24.0, 20.0, 16.0, 14.0, 12.0])
     joints = 21.0 + rises * (1.0 - np.exp(-at_s / 1800.0))
-    told = change(np.column_stack([joints, np.full(len(at_s), 21.0)]))[at_s[:, 0] >= from_s]
-    heat = Inputs("temperatures", at_s[at_s[:, 0] >= from_s, 0], told[:, :6], told[:, 6])
+    values = change(np.column_stack([joints, np.full(len(at_s), 21.0)]))[at_s[:, 0] >= from_s]
+    heat = Inputs("temperatures", at_s[at_s[:, 0] >= from_s, 0], values[:, :6], values[:, 6])
     return [
         each.words for each in doubts(replace(ThermalFit.expected(ROBOT, ROBOT, heat), gain=1e3))
     ]
@@ -365,8 +365,8 @@ def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(tmp_path):
     row = pose_row(pose) | {f"q{at}_rad": angle for at, angle in enumerate(q[0].tolist(), 1)}
     table = tmp_path / "targets.csv"
     table.write_text(f"{','.join(row)}\n{','.join(map(repr, row.values()))}\n", encoding="utf-8")
-    told = ",".join(f"{value:.9f}" for value in warm)
-    done = run("correct", table, "--against", tmp_path, "--temperatures", told, "--json")
+    kelvins = ",".join(f"{value:.9f}" for value in warm)
+    done = run("correct", table, "--against", tmp_path, "--temperatures", kelvins, "--json")
     sent = json.loads(done.out)["targets"][0]
     # The warm arm is at the target with the joints that the target was made of.
     assert [sent[f"q{at}_rad"] for at in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
@@ -387,7 +387,7 @@ def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(tmp_path):
     session.save(tmp_path / "warm")
     path = tmp_path / "warm" / "streams" / "heat.csv"
     head, *rows = (line.split(",") for line in path.read_text(encoding="utf-8").splitlines())
-    rows = [[stamp, *(repr(float(it) + 273.15) for it in told)] for stamp, *told in rows]
+    rows = [[stamp, *(repr(float(it) + 273.15) for it in kelvins)] for stamp, *kelvins in rows]
     path.write_text("\n".join(map(",".join, [head, *rows])) + "\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"heat\.csv, line 2, column temp1_c: .*not in kelvin"):
         Session.load(tmp_path / "warm")

@@ -89,8 +89,8 @@ def shifted(robot, boards, start=10, by=2):
     """From a row on, each image is that of the robot's pose so many rows later."""
     rows = np.arange(len(robot))
     images = np.where(rows >= start, rows + by, rows)
-    there = images < len(rows)
-    return robot[there], boards[images[there]]
+    is_within = images < len(rows)
+    return robot[is_within], boards[images[is_within]]
 
 
 def turned(robot, boards, some=(1, 4, 5, 8, 11, 13, 16, 19)):
@@ -291,8 +291,8 @@ def test_angles_of_one_maker_that_were_stated_as_anothers_are_named(
     tmp_path, monkeypatch, mount, forms
 ):
     monkeypatch.chdir(tmp_path)
-    (robot, boards), (stated, own) = poses_of(mount), forms
-    angles = Rotation.from_matrix(robot[:, :3, :3]).as_euler(own)
+    (robot, boards), (stated, true_form) = poses_of(mount), forms
+    angles = Rotation.from_matrix(robot[:, :3, :3]).as_euler(true_form)
     rotations = Rotation.from_euler(stated, angles).as_matrix()
     pairs_session(mount, compose(rotations, robot[:, :3, 3]), boards).save(tmp_path / "cell")
     cause, mended = followed("cell")
@@ -653,8 +653,8 @@ def test_the_noise_of_scaled_corners_is_scaled_with_them():
     table = session.corner_table
     table = replace(table, sigmas_px=np.full(len(table), 0.1))
     mended = mended_images.mend_images(session.with_content(corners=table)).corner_table
-    own = np.isin(mended.views, [*range(9, 15)])
-    np.testing.assert_allclose(mended.sigmas_px, np.where(own, 0.2, 0.1))
+    is_scaled = np.isin(mended.views, [*range(9, 15)])
+    np.testing.assert_allclose(mended.sigmas_px, np.where(is_scaled, 0.2, 0.1))
 
 
 @pytest.mark.parametrize("views", [1, 24])
@@ -688,8 +688,8 @@ def test_exchanged_columns_of_one_camera_of_several_are_exchanged_back_alone(mon
     stage = Mock(side_effect=error.within("cam_left"))
     monkeypatch.setattr(mended_images, "run_stages", stage)
     table, mended = session.corner_table, mended_images.mend_images(session).corner_table
-    own = np.isin(table.views, [3, 4])[:, None]
-    np.testing.assert_array_equal(mended.px, np.where(own, table.px[:, ::-1], table.px))
+    is_exchanged = np.isin(table.views, [3, 4])[:, None]
+    np.testing.assert_array_equal(mended.px, np.where(is_exchanged, table.px[:, ::-1], table.px))
 
 
 @pytest.mark.parametrize("beyond", [True, slow(False)])
@@ -932,7 +932,7 @@ def test_a_tool_is_taken_off_no_view_without_a_pose():
 def test_corners_are_numbered_back_and_views_without_partner_go():
     px = np.random.default_rng(0).uniform(0, 600, (4, 20, 2))
     # The 8 x 5 inner corners of the board, the first of which is one square from both edges.
-    seen = [(np.arange(20), own) for own in px]
+    seen = [(np.arange(20), view_px) for view_px in px]
     session = Session.from_corners(seen, poses_of(MOUNTS[0], 4)[0], BOARD, (640, 480))
     points = corner_positions(next(iter(session.boards.values())))
     back = turn_boards(session, [1], (180.0, *(1e3 * points.mean(axis=0)[:2])))
@@ -1063,13 +1063,13 @@ def test_corners_of_other_boards_are_no_corners_of_a_pair_of_a_cell():
     for stage in STAGES[:5]:
         run = stage.run(run)
     pair = next(one for one in pairs_of(run, "b") if one.target == "target_plate_b")
-    alone = of_pair(run, "b", pair)
-    (look,) = alone.cameras.values()
-    (board,) = alone.session.boards.values()
+    pair_run = of_pair(run, "b", pair)
+    (look,) = pair_run.cameras.values()
+    (board,) = pair_run.session.boards.values()
     assert max(corners.ids.max() for corners in look.corners.values()) < len(
         corner_positions(board)
     )
-    assert {*look.corners} == {view.number for view in alone.session.views}
+    assert {*look.corners} == {view.number for view in pair_run.session.views}
     assert {*look.corners} < {*run.cameras[pair.camera].corners}
 
 

@@ -147,10 +147,10 @@ def test_a_held_lens_explains_a_misfit_that_it_is_large_enough_for() -> None:
 def test_effects_of_a_cause_are_no_causes_and_have_no_steps_of_their_own() -> None:
     wrong = Finding("wrong_views", "View 3 was left out.", Remedy("Delete its row."), (3,))
     short = Finding("stops_short", "The arm stood short.", mahalanobis_sq=300.0)
-    alone, beside = (judge(changed(SOUND, warnings=some)) for some in ((wrong,), (short, wrong)))
-    assert ids(alone) == ["wrong_views"]
-    assert ids(beside) == ["stops_short"]
-    assert next(one for one in beside.findings if one.kind == "wrong_views").do is None
+    sole, joint = (judge(changed(SOUND, warnings=some)) for some in ((wrong,), (short, wrong)))
+    assert ids(sole) == ["wrong_views"]
+    assert ids(joint) == ["stops_short"]
+    assert next(one for one in joint.findings if one.kind == "wrong_views").do is None
 
 
 def test_errors_of_an_arm_are_as_likely_as_what_another_cure_leaves() -> None:
@@ -693,9 +693,9 @@ def test_a_tool_that_was_active_is_asked_for(mount, tool_mm, where) -> None:
     verdict = calibrate(pairs_session(mount, poses, cell.cam_from_target)).verdict
     # It is a question, and no doubt.
     assert (verdict.status, verdict.causes) == ("good", ())
-    asked = [finding for finding in verdict.findings if finding.kind == "carried_away"]
-    assert len(asked) == bool(where)
-    for finding in asked:
+    questions = [finding for finding in verdict.findings if finding.kind == "carried_away"]
+    assert len(questions) == bool(where)
+    for finding in questions:
         assert where in finding.words
         assert "Was a tool active on the controller" in finding.words
         assert finding.do in verdict.next_steps
@@ -770,8 +770,8 @@ def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: f
     # 4,096 even points leave 0.007 at most, as 200,000 drawn ones leave three times 0.001.
     for share in (0.3, 0.7, 0.95):
         turn, shift = np.quantile(turned, share), np.quantile(shifted, share)
-        both = np.mean((turned < turn) & (shifted < shift))
-        assert chance_within(spreads, turn, shift, freedom) == pytest.approx(both, abs=0.01)
+        share_within = np.mean((turned < turn) & (shifted < shift))
+        assert chance_within(spreads, turn, shift, freedom) == pytest.approx(share_within, abs=0.01)
         assert chance_within(spreads, np.inf, shift, freedom) == pytest.approx(share, abs=0.01)
         assert chance_within(spreads, turn, np.inf, freedom) == pytest.approx(share, abs=0.01)
     radius = radius_within(spreads, 0.95, freedom)
@@ -789,8 +789,8 @@ def without_arm_errors(known: RunState) -> RunState:
     """The same with an arm of which nothing but noise is known."""
     answer, solved = known.assessment, known.cell_fit
     arms = {name: replace(arm, errors=None) for name, arm in solved.arms.items()}
-    beside = {name: part for name, part in answer.fit.by_source.items() if name != "arm"}
-    changed = replace(answer, fit=replace(answer.fit, by_source=beside))
+    by_source = {name: part for name, part in answer.fit.by_source.items() if name != "arm"}
+    changed = replace(answer, fit=replace(answer.fit, by_source=by_source))
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
 
 
@@ -1347,8 +1347,8 @@ def test_a_result_states_the_need_that_it_meets() -> None:
     assert plain.verdict.good_for_mm == pytest.approx(0.2, abs=0.1)
     need = {"mm": plain.verdict.good_for_mm, "at": [0.5, 0.1, 0.0]}
     session = replace(known.session, document={**known.session.document, "need": need})
-    asked = result_of(calibrated(simulate(CellOptions(views=12)), session=session))
+    with_need = result_of(calibrated(simulate(CellOptions(views=12)), session=session))
     # The camera looks at a declared place as it looked at the board.
-    assert asked.need.probability == pytest.approx(0.95, abs=1e-3)
-    again = Calibration.from_json(json.dumps(to_document(asked)), "again")
-    assert (again.need, again.verdict) == (asked.need, asked.verdict)
+    assert with_need.need.probability == pytest.approx(0.95, abs=1e-3)
+    again = Calibration.from_json(json.dumps(to_document(with_need)), "again")
+    assert (again.need, again.verdict) == (with_need.need, with_need.verdict)

@@ -70,11 +70,11 @@ BEND_M = np.array([[4e-4, 0.0, 0.0], [0.0, -4e-4, 0.0], [0.0, 2e-4, 4e-4]])
 
 def short(cell):
     """Poses that were commanded: a two-hundredth of each motion is not reached."""
-    sent, there = cell.robot.base_from_flange, [cell.robot.base_from_flange[0]]
+    sent, reached = cell.robot.base_from_flange, [cell.robot.base_from_flange[0]]
     for pose in sent[1:]:
-        there.append(pose @ exp(5e-3 * log(invert(pose) @ there[-1])))
+        reached.append(pose @ exp(5e-3 * log(invert(pose) @ reached[-1])))
     # What the camera sees is where the arm stands; what is logged is where it was sent.
-    left = log(invert(np.array(there)) @ sent)
+    left = log(invert(np.array(reached)) @ sent)
     return reporting(cell, base_from_flange=cell.robot.base_from_flange @ exp(left))
 
 
@@ -99,9 +99,9 @@ def short_of_places(cell):
 
 def onwards(cell):
     """Poses that are read when the arm is a two-hundredth of the way to its next stop."""
-    there = cell.robot.base_from_flange
-    away = np.append(log(invert(there[:-1]) @ there[1:]), np.zeros((1, 6)), axis=0)
-    return reporting(cell, base_from_flange=there @ exp(5e-3 * away))
+    poses = cell.robot.base_from_flange
+    away = np.append(log(invert(poses[:-1]) @ poses[1:]), np.zeros((1, 6)), axis=0)
+    return reporting(cell, base_from_flange=poses @ exp(5e-3 * away))
 
 
 def tilted(cell):
@@ -213,8 +213,8 @@ def with_marks(cell, marked):
     looks = list[Corners]()
     for at, (seen, pose) in enumerate(zip(cell.corners, cell.cam_from_target, strict=True)):
         ends = (apply(pose, each[seen.ids]) for each in (marked(at, points), points))
-        there, drawn = (project(camera, end) for end in ends)
-        looks.append(replace(seen, px=seen.px + there - drawn))
+        marked_px, drawn = (project(camera, end) for end in ends)
+        looks.append(replace(seen, px=seen.px + marked_px - drawn))
     return showing(cell, looks)
 
 
@@ -238,9 +238,9 @@ def sagging(cell):
 
 def on_the_way(cell):
     """Poses that are read when the arm is a twelfth of the way to its next stop."""
-    there = cell.robot.base_from_flange
-    away = np.append(log(invert(there[:-1]) @ there[1:]), np.zeros((1, 6)), axis=0)
-    return reporting(cell, base_from_flange=there @ exp(0.08 * away))
+    poses = cell.robot.base_from_flange
+    away = np.append(log(invert(poses[:-1]) @ poses[1:]), np.zeros((1, 6)), axis=0)
+    return reporting(cell, base_from_flange=poses @ exp(0.08 * away))
 
 
 def logged_once(axis):
@@ -841,10 +841,10 @@ def test_the_views_after_a_bump_are_calibrated_as_advised(tmp_path, monkeypatch)
     assert advised.command == "visioncal calibrate SESSION -o NEW --views 9-17"
     options = ("calibrate", "bumped", "-o", "after", "--no-report", "--no-recording", "--views")
     assert visioncal(*options, "9-17").status == 0
-    alone = Calibration.load("after")
-    assert {cause.kind for cause in alone.verdict.causes} == {"few_stops"}
-    assert [view.view for view in alone.views] == list(range(9, 18))
-    edge = alone.edges["flange_from_cam"]
+    after = Calibration.load("after")
+    assert {cause.kind for cause in after.verdict.causes} == {"few_stops"}
+    assert [view.view for view in after.views] == list(range(9, 18))
+    edge = after.edges["flange_from_cam"]
     moved = simulate(replace(OPEN, camera_moved_m=2e-3)).transforms["flange_from_cam"]
     away = invert(moved) @ edge.matrix
     # By chance one cell in a hundred is farther away.

@@ -508,11 +508,11 @@ def test_messages_are_of_use_in_their_place(rendered, pairs, tmp_path, monkeypat
     for name in ("fanuc", "yaskawa", "zivid"):
         file = tmp_path / f"{name}.out"
         visioncal("export", out, "--to", name, "-o", file, "--force").good()
-        beside = file.with_name(f"{file.name}.txt")
-        assert f"verdict {Calibration.load(out).verdict.status}" in beside.read_text()
-        beside.write_text("another's")
+        note = file.with_name(f"{file.name}.txt")
+        assert f"verdict {Calibration.load(out).verdict.status}" in note.read_text()
+        note.write_text("another's")
         file.unlink()
-        assert beside.name in visioncal("export", out, "--to", name, "-o", file).err
+        assert note.name in visioncal("export", out, "--to", name, "-o", file).err
         assert not file.exists()
     visioncal("export", out, "--to", "kuka", "-o", tmp_path / "kuka", "--force").good()
     assert not (tmp_path / "kuka.txt").exists()
@@ -643,9 +643,9 @@ def test_broken_streams_take_no_result_away(pairs, tmp_path, out, err, options, 
     with out() as stdout, err() as stderr:
         assert status(stdout, stderr, "calibrate", pairs, "-o", folder, *options) == ends
         if said is not None:
-            told = stderr.getvalue()
-            assert said in told
-            assert bool(said) == bool(told)
+            errors = stderr.getvalue()
+            assert said in errors
+            assert bool(said) == bool(errors)
     assert sorted(path.name for path in folder.iterdir()) == FILES
     with out() as stdout, err() as stderr:
         status(stdout, stderr, "verify", pairs, "--against", folder, *options)
@@ -830,11 +830,11 @@ def test_mistakes_about_a_fixture_are_answered_with_the_next_step(place):
     view, name, x, *others = points[4].split(",")
     points[4] = ",".join((view, name, str(float(x) + 0.004), *others))
     (place / "missed.csv").write_text("\n".join(points), "utf-8")
-    asked = ("fixture", "cell/points.csv", "--cad", "cell/cad.csv", "-c", "out")
+    command = ("fixture", "cell/points.csv", "--cad", "cell/cad.csv", "-c", "out")
     for words in (
-        ("fixture", "missed.csv", *asked[2:], "--name", "jig"),
-        (*asked, "--name", "tray", "--touch-noise-mm", "0.005"),
-        (*asked, "--name", "bin", "--touch-noise-mm=0.005"),
+        ("fixture", "missed.csv", *command[2:], "--name", "jig"),
+        (*command, "--name", "tray", "--touch-noise-mm", "0.005"),
+        (*command, "--name", "bin", "--touch-noise-mm=0.005"),
     ):
         # That of a value as one word is that of two.
         first = visioncal(*words).good() if "bin" in words else follow(*words).runs[0].good()

@@ -32,7 +32,7 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def told(*messages, status=2):
+def program_of(*messages, status=2):
     """A program that says one message a run, and the last one from then on."""
     left = list(messages)
 
@@ -63,12 +63,12 @@ def test_a_step_that_cannot_be_followed_is_noticed(place, messages, why):
     (cell / "session.toml").write_text('name = "cell"\ntarget = "charuco_9x6_30mm"\n')
     (cell / "views.csv").write_text("view\n0\n1\n")
     if why is None:
-        followed = follow("calibrate", "cell", run=told(*messages))
+        followed = follow("calibrate", "cell", run=program_of(*messages))
         assert len(followed.done) == 1
         assert "[camera]\nresolution = [" in (cell / "session.toml").read_text()
     else:
         with pytest.raises(AssertionError, match=why):
-            follow("calibrate", "cell", run=told(*messages))
+            follow("calibrate", "cell", run=program_of(*messages))
 
 
 def resized(folder: Path, every: int, size: tuple[int, int]) -> None:

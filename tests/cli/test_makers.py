@@ -170,9 +170,9 @@ def test_views_about_one_axis_are_asked_for_tilts_before_a_form(tmp_path):
     options = CellOptions(views=10, motion="one_axis", seed=4)
     turned = cell_session(simulate(options), "cell", seen="poses")
     source = table_of(turned, "kuka", tmp_path / "log.csv")
-    asked = visioncal("convert", source, tmp_path / "cell", "--mount", "eye-in-hand")
-    asked.refused("All views turn about one axis", "First add 3 or more views")
-    assert "--robot-form kuka, as the columns' names suggest, or" in asked.err
+    refused = visioncal("convert", source, tmp_path / "cell", "--mount", "eye-in-hand")
+    refused.refused("All views turn about one axis", "First add 3 or more views")
+    assert "--robot-form kuka, as the columns' names suggest, or" in refused.err
 
 
 def test_a_form_of_a_library_is_no_maker_s(cell, tmp_path):
@@ -409,15 +409,15 @@ def test_targets_are_typed_and_sent_in_the_robot_s_form(work, of_maker, maker, t
         visioncal("correct", source, "-c", out, "-o", file).good()
         with file.open() as rows:
             sent[name] = list(csv.DictReader(rows))
-    own = [f"{maker}_{name.lower()}" for name in names]
+    columns = [f"{maker}_{name.lower()}" for name in names]
     assert list(sent["typed"][0])[: 1 + len(names)] == ["what", *names]
-    for row, beside in zip(sent["typed"], sent["ours"], strict=True):
-        place = [float(beside[name]) for name in POSE]
+    for row, standard in zip(sent["typed"], sent["ours"], strict=True):
+        place = [float(standard[name]) for name in POSE]
         target = RigidTransform.from_components(place[:3], Rotation.from_quat(place[3:]))
         # The tables differ by what a controller's digits leave.
         for pose in (
             pose_of(maker, [row[name] for name in names]),
-            pose_of(maker, [beside[name] for name in own]),
+            pose_of(maker, [standard[name] for name in columns]),
         ):
             assert np.abs(pose - target.as_matrix()).max() < 1e-6
         assert float(row["moved_mm"]) > 0.1

@@ -160,9 +160,9 @@ def test_files_of_numpy_are_read_without_it(tmp_path, dtype, order):
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", array=array, scalar=array[0, 0])
     np.testing.assert_array_equal(read_arrays(tmp_path / "a.npy")["matrix"], array)
-    both = read_arrays(tmp_path / "a.npz")
-    np.testing.assert_array_equal(both["array"], array)
-    assert both["scalar"].shape == ()
+    arrays = read_arrays(tmp_path / "a.npz")
+    np.testing.assert_array_equal(arrays["array"], array)
+    assert arrays["scalar"].shape == ()
 
 
 class Executed:

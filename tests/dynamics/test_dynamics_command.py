@@ -57,8 +57,8 @@ def folder(tmp_path_factory):
 
 
 def test_identified_dynamics_predict_other_motions(folder, tmp_path):
-    asked = ("--stream", "excite", "--stream", "sweeps")
-    done = visioncal("dynamics", "identify", folder, *asked, "-o", tmp_path / "out").good()
+    options = ("--stream", "excite", "--stream", "sweeps")
+    done = visioncal("dynamics", "identify", folder, *options, "-o", tmp_path / "out").good()
     assert "good" in done.out
     assert "the last 30 % of streams/excite.csv" in done.out
     result = Identified.load(tmp_path / "out")
@@ -103,9 +103,9 @@ def test_wrong_options_are_named(folder, arguments, words):
 
 def test_a_session_without_torques_or_robot_is_named(folder, tmp_path):
     session = Session.load(folder)
-    there = [name for name in session.streams["fresh"].columns if not name.startswith("tau")]
+    kept = [name for name in session.streams["fresh"].columns if not name.startswith("tau")]
     stream = session.streams["fresh"]
-    bare = type(stream)(tuple(there), np.column_stack([stream[name] for name in there]))
+    bare = type(stream)(tuple(kept), np.column_stack([stream[name] for name in kept]))
     Session.of_streams(session.document, {"fresh": bare}).save(tmp_path / "bare")
     visioncal("dynamics", "identify", tmp_path / "bare").refused(
         "no stream with torques or currents: fresh"
@@ -332,8 +332,8 @@ def test_without_known_inertias_there_are_no_bodies(run):
 def test_the_command_weighs(written, world, tmp_path):
     world.full.save(tmp_path / "loaded")
     arguments = ("dynamics", "payload", tmp_path / "loaded", "--against", written)
-    told = json.loads(visioncal(*arguments, "--json").out)
-    assert told["mass_kg"] == pytest.approx(2.8, abs=0.05)
+    document = json.loads(visioncal(*arguments, "--json").out)
+    assert document["mass_kg"] == pytest.approx(2.8, abs=0.05)
     assert "on a UR: set_target_payload(2." in visioncal(*arguments).out
     arguments = ("dynamics", "validate", tmp_path / "loaded", "--against", written)
     predicted = visioncal(*arguments)

@@ -179,15 +179,17 @@ def urdf_of(robot):
 
 def test_an_arms_mass_is_no_fact_of_a_recording():
     """A session's digest stays what it was before its robot's table told inertias and drives."""
-    told = read_robot_document("panda")
+    document = read_robot_document("panda")
     # The table as it was, in its own words.
     geometry = {"name", "a_m", "alpha_rad", "d_m", "theta_offset_rad", "lower_deg", "upper_deg"}
-    bare = [{key: value for key, value in row.items() if key in geometry} for row in told["joint"]]
-    assert bare != told["joint"]
+    bare = [
+        {key: value for key, value in row.items() if key in geometry} for row in document["joint"]
+    ]
+    assert bare != document["joint"]
     session = kept_session()
     digests = [
-        replace(session, robot_document=told | {"joint": rows}).digest()
-        for rows in (told["joint"], bare, bare[:-1])
+        replace(session, robot_document=document | {"joint": rows}).digest()
+        for rows in (document["joint"], bare, bare[:-1])
     ]
     assert digests[0] == digests[1] != digests[2]
 
@@ -407,9 +409,9 @@ def test_joints_that_stand_still_are_named():
     built, done = real_dynamics("ur5e", rng), multi_sine(6, rng)
     for values in (done.q, done.dq, done.ddq):
         values[:, 3] = 0.0
-    with pytest.raises(DegenerateError, match=r"joint 4 \(wrist_1_joint\) stands still") as told:
+    with pytest.raises(DegenerateError, match=r"joint 4 \(wrist_1_joint\) stands still") as refusal:
         identify(known_arm(), [recorded(built, done, rng)])
-    assert "visioncal dynamics plan" in told.value.next_step
+    assert "visioncal dynamics plan" in refusal.value.next_step
 
 
 def test_results_survive_the_disk(tmp_path, worlds):
@@ -600,8 +602,8 @@ def test_stamps_of_another_unit_are_refused(stream):
     def scale(columns):
         columns["stamp_s"] *= 1e3
 
-    told = raised(DataError, "its samples are 2 s apart", conditioned, changed(stream, scale))
-    assert "divide by 1000" in told.next_step
+    refusal = raised(DataError, "its samples are 2 s apart", conditioned, changed(stream, scale))
+    assert "divide by 1000" in refusal.next_step
 
 
 def test_short_recordings_are_refused(stream):

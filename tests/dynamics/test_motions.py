@@ -294,14 +294,14 @@ def test_sweeps_move_one_joint_at_a_time_within_all_limits(sweeps):
 
 def test_every_joint_sweeps_over_the_same_place_in_both_directions_at_every_speed(sweeps):
     for joint in range(6):
-        own = [stroke for stroke in sweeps.strokes if stroke.sweeps and stroke.joint == joint]
-        there, back = own[::2], own[1::2]
-        speeds = [value.speed for value in there]
+        strokes = [stroke for stroke in sweeps.strokes if stroke.sweeps and stroke.joint == joint]
+        forth, back = strokes[::2], strokes[1::2]
+        speeds = [value.speed for value in forth]
         assert speeds == sorted(speeds)
         assert len(speeds) == 4
         assert speeds[0] == pytest.approx(0.02)
         assert speeds[-1] > 1.0
-        for one, other in zip(there, back, strict=True):
+        for one, other in zip(forth, back, strict=True):
             assert (one.begin, one.end, one.speed) == (other.end, other.begin, other.speed)
             # Besides its ramps it holds its speed for some time.
             assert abs(one.end - one.begin) / one.speed - one.ramp_s > 0.39

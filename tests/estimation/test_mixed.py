@@ -122,16 +122,18 @@ def test_the_curvature_is_the_average_information():
 
 def test_the_unknowns_are_the_best_prediction_with_its_covariance():
     example = _Example()
-    here = example.model.at(LOGS, is_sloped=False)
+    estimate = example.model.at(LOGS, is_sloped=False)
     squares, is_random = np.exp(2.0 * LOGS), example.shares.any(axis=1)
-    own = np.where(is_random, example.shares @ squares, 0.0)
+    variances = np.where(is_random, example.shares @ squares, 0.0)
     slopes = example.jacobian
-    noise = example.covariance(LOGS) - (slopes * own) @ slopes.T
+    noise = example.covariance(LOGS) - (slopes * variances) @ slopes.T
     information = slopes.T @ np.linalg.solve(noise, slopes)
-    information[is_random, is_random] += 1.0 / own[is_random]
+    information[is_random, is_random] += 1.0 / variances[is_random]
     gradient = slopes.T @ np.linalg.solve(noise, example.residuals)
-    np.testing.assert_allclose(here.values, np.linalg.solve(information, gradient), atol=1e-9)
-    np.testing.assert_allclose(here.root @ here.root.T, np.linalg.inv(information), atol=1e-9)
+    np.testing.assert_allclose(estimate.values, np.linalg.solve(information, gradient), atol=1e-9)
+    np.testing.assert_allclose(
+        estimate.root @ estimate.root.T, np.linalg.inv(information), atol=1e-9
+    )
 
 
 def test_the_most_likely_sizes_have_no_slope_between_their_bounds():
@@ -155,7 +157,7 @@ def test_the_likeliest_size_of_more_unknowns_is_that_of_the_likelihood(true_size
     size, gain = example.model.likely_size(example.model.at(LOGS), moved, everywhere)
     without = example.value(LOGS)
 
-    def beside(value):
+    def value_with(value):
         added = value**2 * np.einsum("uik,vjk->uivj", moved, moved).reshape(45, 45)
         original = example.covariance
         example.covariance = lambda logs: original(logs) + np.pad(added, (0, 2))
@@ -165,7 +167,7 @@ def test_the_likeliest_size_of_more_unknowns_is_that_of_the_likelihood(true_size
             del example.covariance
 
     sizes = np.exp(np.arange(np.log(1e-4), np.log(1e2), 0.1))
-    values = np.array([beside(value) for value in sizes])
+    values = np.array([value_with(value) for value in sizes])
     # Between two sizes that are tried, a value is hardly larger.
     assert gain == pytest.approx(max(without - values.min(), 0.0), abs=0.1)
     if true_size:
@@ -234,8 +236,8 @@ def test_eliminated_unknowns_are_noise_that_corners_share(corners):
     for view in range(views):
         rows = stack.view_of == view
         by_poses[rows, :, 6 * view : 6 * view + 6] = now.by_pose[rows]
-        own = np.where(rows[:, None, None], stack.zooms, 0.0).reshape(len(covariance), -1)
-        covariance += own @ own.T
+        zooms = np.where(rows[:, None, None], stack.zooms, 0.0).reshape(len(covariance), -1)
+        covariance += zooms @ zooms.T
     slopes = np.concatenate([by_poses, shared], axis=2).reshape(len(covariance), -1)
     normal = slopes.T @ np.linalg.solve(covariance, slopes)
     inner, size = normal[: 6 * views, : 6 * views], 6 * views
@@ -437,8 +439,8 @@ def test_weights_of_views_are_what_noise_asks_for():
     # A variance of 70 degrees of freedom is known to 17 %, its root to 8 %.
     assert np.std(np.log(scaled)) < 0.12
     # Drawn towards all: less is made of a view than its residuals alone would.
-    alone = np.log(np.sqrt(squares / freedom))
-    assert np.std(np.log(weights_by_view(squares, freedom))) < np.std(alone)
+    by_residuals = np.log(np.sqrt(squares / freedom))
+    assert np.std(np.log(weights_by_view(squares, freedom))) < np.std(by_residuals)
     # Views of one noise weigh alike: one of ten thousand is called uneven by chance.
     for each in (8.0, 100.0):
         all_of = np.full(20, each)

@@ -184,11 +184,11 @@ def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
     # A column more changes the order in which a processor's kernels sum, and so the last bits.
     np.testing.assert_allclose(moved.edges, without.edges, rtol=0.0, atol=1e-14)
     free = problem.with_effects([replace(effect, held=np.zeros(1, dtype=bool))])
-    there = Solution(moved, NETWORK_NOISE)
-    apart = covariance_of(held, there) / covariance_of(free, there) - 1.0
+    solution = Solution(moved, NETWORK_NOISE)
+    apart = covariance_of(held, solution) / covariance_of(free, solution) - 1.0
     assert np.abs(apart).max() < 1e-9
-    alone = covariance_of(problem, Solution(without, NETWORK_NOISE))
-    assert np.trace(covariance_of(held, there)[:-1, :-1]) > 1.5 * np.trace(alone)
+    exact = covariance_of(problem, Solution(without, NETWORK_NOISE))
+    assert np.trace(covariance_of(held, solution)[:-1, :-1]) > 1.5 * np.trace(exact)
 
 
 def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
@@ -269,8 +269,8 @@ def test_repeated_views_of_a_still_board_count_as_one():
     for count in (1, 5, 40):
         some = fixed.subset(np.arange(40) < count)
         known = covariance_of(some, Solution(State(edges, np.zeros(0)), NETWORK_NOISE))
-        mine = known[some.edge_columns("target_floor"), some.edge_columns("target_floor")]
-        np.testing.assert_allclose(mine, single, atol=1e-6 * single.max())
+        of_target = known[some.edge_columns("target_floor"), some.edge_columns("target_floor")]
+        np.testing.assert_allclose(of_target, single, atol=1e-6 * single.max())
     # What the boards on the flanges tell is as without.
     moving = problem.subset(~still & ~problem.observations.involves("target_floor"))
     plain = replace(moving, with_repeats=False)
@@ -625,15 +625,15 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     nothing = PriorInformation(np.zeros((3, 3)), np.zeros(3))
     effect = Effect.free("arm", nothing, flange_jacobian={ROBOT: moves})
     wider = problem.with_effects([*problem.effects, effect])
-    there = replace(fit.state, values=np.append(fit.state.values, np.zeros(3)))
-    beside = robot_likelihood(problem, fit.state, fit.noise).with_moves(0, moves)
-    expected = robot_likelihood(wider, there, fit.noise)
-    np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
+    wider_state = replace(fit.state, values=np.append(fit.state.values, np.zeros(3)))
+    extended = robot_likelihood(problem, fit.state, fit.noise).with_moves(0, moves)
+    expected = robot_likelihood(wider, wider_state, fit.noise)
+    np.testing.assert_allclose(extended.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
     if kind != "combined":
         return
     # What the wider problem has left of the arm's columns beside them is rounding.
     levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
-    found, values = (item.most_likely(levels, fixed)[1] for item in (beside, expected))
+    found, values = (item.most_likely(levels, fixed)[1] for item in (extended, expected))
     assert found == pytest.approx(values, abs=1e-5)
 
 
@@ -690,10 +690,10 @@ def test_between_samples_pose_and_speed_are_right() -> None:
     moved = sampled(100, lambda value: np.arange(len(value)) % 7 != 3)
     assert moved.covers(at_s).all()
     assert np.abs(log(invert(swung(at_s)) @ moved.at(at_s))).max() < 5e-6
-    told = sampled(125).speeds(at_s)
+    speeds = sampled(125).speeds(at_s)
     true = log(invert(swung(at_s - step_s)) @ swung(at_s + step_s)) / (2 * step_s)
     # Means over 0.04 s.
-    assert np.abs(told - true).max() < 2e-3 * np.abs(true).max()
+    assert np.abs(speeds - true).max() < 2e-3 * np.abs(true).max()
 
 
 def test_a_slip_that_hides_in_the_noise_of_single_views_is_found():

@@ -81,9 +81,9 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
     fit = solve(made(1, 16).cell).fit
     for effect in effects_of_frames(fit, "flange"):
         each = products(fit, added_by(fit, effect), effect.count)
-        alone = _errors_by_stop(fit, "flange", [each])
-        grid, beside = _grid_of(fit, "flange", alone, creeps=True)
-        white = beside(next(grid))
+        by_stop = _errors_by_stop(fit, "flange", [each])
+        grid, at_stops = _grid_of(fit, "flange", by_stop, creeps=True)
+        white = at_stops(next(grid))
         # With boards held as the fit has them.
         _, pull, _ = judged(white, [], 0.0)
         left = white.total[len(pull) :, len(pull) :] - pull.T @ pull

@@ -32,8 +32,8 @@ def warmed(seed, *, temperatures=True, **heat):
 
 def inputs(kind):
     stamps_s, rng = np.arange(0.0, 7200.0, 40.0), np.random.default_rng(0)
-    told = 4.0 + 20.0 * (1.0 - np.exp(-stamps_s / 2000.0))[:, None] + rng.uniform(0, 2, (180, 6))
-    return Inputs(kind, stamps_s, told, 21.0 + np.sin(stamps_s / 3000.0))
+    values = 4.0 + 20.0 * (1.0 - np.exp(-stamps_s / 2000.0))[:, None] + rng.uniform(0, 2, (180, 6))
+    return Inputs(kind, stamps_s, values, 21.0 + np.sin(stamps_s / 3000.0))
 
 
 def moments_at(stamps_s):
@@ -77,9 +77,12 @@ def test_growth_and_drift_are_found_within_their_covariance(temperatures, draws)
         fit = solve(cell).fit
         assert fit.used.mean() > 0.95
         (heat,) = (effect for effect in fit.unknowns.effects if effect.kind == "heat")
-        values, own = fit.state.values["effect", heat.name], fit.covariance(("effect", heat.name))
+        values, covariance = (
+            fit.state.values["effect", heat.name],
+            fit.covariance(("effect", heat.name)),
+        )
         arm, units = heat.arm(values), np.repeat([5.5e-6, 1e-5], 6)
-        sigmas = np.sqrt(np.diag(own))[:12] * units
+        sigmas = np.sqrt(np.diag(covariance))[:12] * units
         found = np.concatenate([arm.growth_per_k, arm.drift_rad_per_k])
         true = np.concatenate([how.heats.growth_per_k, how.heats.drift_rad_per_k])
         keys = [("edge", "cam"), ("edge", "target")]

@@ -215,11 +215,11 @@ class Dense:
             for part in term.parts:
                 width = mixed.bodies[part.body].width
                 for unit in range(len(mixed.bodies[part.body].stops)):
-                    own: IntArray = starts[part.body] + width * unit + np.arange(width)
+                    places: IntArray = starts[part.body] + width * unit + np.arange(width)
                     at = np.append(part.columns, self.count)
-                    gram[np.ix_(own, own)] += part.errors[unit]
-                    gram[np.ix_(own, at)] += part.cross[unit]
-                    gram[np.ix_(at, own)] += part.cross[unit].T
+                    gram[np.ix_(places, places)] += part.errors[unit]
+                    gram[np.ix_(places, at)] += part.cross[unit]
+                    gram[np.ix_(at, places)] += part.cross[unit].T
             self.grams.append(gram)
 
     def information(self, logs):

@@ -61,8 +61,8 @@ def test_springs_bend_as_the_simulated_arm_does():
     q, values = arm.joints, np.array(options.compliance_rad_per_nm)
     hung = Payload(8.0, (0.0, 0.03, 0.15), (0.0, 0.0, -30.0))
     loads = Loads.alike(len(q), hung.kg, hung.centre_m, hung.force_n)
-    for told, carried in ((None, ()), (loads, [hung] * len(q))):
-        found = Springs("flange", robot).twists(moments_at(q, robot, loads=told), values)
+    for stated, carried in ((None, ()), (loads, [hung] * len(q))):
+        found = Springs("flange", robot).twists(moments_at(q, robot, loads=stated), values)
         true = log(invert(forward(arm.arm, q)) @ arm.flange_at(q, carried))
         assert np.abs(true[:, 3:]).max() > 2e-3
         # What the third round changes: a hundredth of a hundredth.
@@ -97,10 +97,10 @@ def squares_of(made, fit, effect, true):
     pairs = zip(truth, keys, strict=True)
     away = np.concatenate([log(invert(at) @ fit.edge(key[1])) for at, key in pairs])
     off = fit.state.values["effect", effect] - np.array(true)
-    own = fit.covariance(("effect", effect))
+    covariance = fit.covariance(("effect", effect))
     return (
         away @ np.linalg.solve(fit.covariance(*keys), away),
-        off @ np.linalg.solve(own, off),
+        off @ np.linalg.solve(covariance, off),
     )
 
 
@@ -190,8 +190,8 @@ def test_play_is_found_by_the_order_of_the_stops_alone(draws):
         made = simulate(replace(GOOD, views=30, branches=True, seed=seed, mount=MOUNTS[seed % 2]))
         q = made.robot.joints
         came = -np.sign(np.diff(q, axis=0, prepend=q[:1]))
-        told = q - 0.5 * came * np.array(PLAY)
-        made = reporting(made, joints=told, base_from_flange=forward(made.robot.arm, told))
+        encoders = q - 0.5 * came * np.array(PLAY)
+        made = reporting(made, joints=encoders, base_from_flange=forward(made.robot.arm, encoders))
         fit = solve(cell_of(made)).fit
         assert fit.used.all()
         squares.append(squares_of(made, fit, "play flange", PLAY))

@@ -81,13 +81,13 @@ def tracked(
             )
             sightings.append(Sighting(len(sightings), stop, "tracker", name, evidence))
     branches = {"flange": Branch("base", robot="flange"), "base": Branch("cell", known=np.eye(4))}
-    own = "tip" if is_touch else "tracker"
-    branches |= {own: Branch("flange" if is_touch else "cell")}
+    device = "tip" if is_touch else "tracker"
+    branches |= {device: Branch("flange" if is_touch else "cell")}
     branches |= {name: Branch("base" if is_touch else "flange") for name in names}
     arms = {"flange": Arm("flange", reported)}
     moments = Moments.of(arms, even_progress(stops))
     cell = Cell(Tree("cell", branches), arms, {}, {}, tuple(sightings), moments)
-    return cell, {own: seer, **on_flange}
+    return cell, {device: seer, **on_flange}
 
 
 def is_fair(squares, degrees):

@@ -37,8 +37,8 @@ def test_joints_come_from_where_they_moved_last():
     # From below where it rose; nothing is known of the first stop, nor of one without a pose.
     assert arm.sides.tolist() == [[0, 0], [-1, 1], [-1, 1], [0, 0], [1, -1]]
     stated = replace(Loads.none(5), side=np.array([1.0, -1.0, 0.0, 0.0, 1.0]))
-    told = replace(arm, loads=stated)
-    assert told.sides[:, 1].tolist() == [1, -1, 0, 0, 1]
+    loaded = replace(arm, loads=stated)
+    assert loaded.sides[:, 1].tolist() == [1, -1, 0, 0, 1]
 
 
 def test_a_sweep_has_rates_that_move_the_flange_from_one_time_to_another():

@@ -159,8 +159,8 @@ def test_an_arm_that_moves_between_pose_and_image_is_found_and_one_that_stands_d
         (short,) = (effect for effect in fit.unknowns.effects if effect.kind == kind)
         moved = short.twists(small.cell.moments, fit.state.values["effect", short.name])
         # Screws: the straight line, and how far a screw departs from it.
-        by_line, _, beside, *_ = np.moveaxis(short.columns(small.cell.moments, np.ones(16)), 2, 0)
-        true = -0.01 * (by_line + beside)
+        by_line, _, by_screw, *_ = np.moveaxis(short.columns(small.cell.moments, np.ones(16)), 2, 0)
+        true = -0.01 * (by_line + by_screw)
         # Motions of 0.3 m and more, where a tenth of a millimetre is noise.
         assert moved == pytest.approx(true, abs=6e-4)
         squares.append(squares_of(small, fit, {})[0])

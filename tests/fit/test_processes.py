@@ -30,11 +30,11 @@ def two_arms():
 def test_information_of_single_stops_adds_up_to_that_of_the_fit(cell):
     fit, p = solve(cell).fit, None
     for flange in fit.unknowns.erring:
-        alone = _errors_by_stop(fit, flange)
+        by_stop = _errors_by_stop(fit, flange)
         p = fit.unknowns.count
-        total = alone.rest.copy()
-        noise = np.linalg.inv(alone.known + alone.independent)
-        total += np.einsum("uia,uij,ujb->ab", alone.rows, noise, alone.rows)
+        total = by_stop.rest.copy()
+        noise = np.linalg.inv(by_stop.known + by_stop.independent)
+        total += np.einsum("uia,uij,ujb->ab", by_stop.rows, noise, by_stop.rows)
         covariance = np.linalg.inv(total[:p, :p])
         scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
         # Stops that say nothing of the flange are left out: they are none of these cells'.
@@ -130,10 +130,10 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     shape = fit.state.values["shape", "target"] + 1e-4 * np.eye(10)[0]
     state = State({**fit.state.values, ("shape", "target"): shape}, fit.state.errors)
     fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
-    alone = _errors_by_stop(fit, "flange")
+    by_stop = _errors_by_stop(fit, "flange")
     (board,) = _boards(fit)
-    grid, beside = _grid_of(fit, "flange", alone, creeps=True)
-    white = beside(next(grid))
+    grid, at_stops = _grid_of(fit, "flange", by_stop, creeps=True)
+    white = at_stops(next(grid))
     found = [judged(white, [board], off)[0] for off in (0.0, 1e-2)]
     values = []
     for sigma in (3e-4, 1e-2):
@@ -148,8 +148,8 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     # Of any size, it is off by what the whole likelihood says.
     (square,) = judged(white, [board], 1e-2)[2]
     off = best.values[board.column] + board.past
-    own = best.covariance[board.column, board.column]
-    assert square == pytest.approx(off**2 + own, rel=1e-3)
+    variance = best.covariance[board.column, board.column]
+    assert square == pytest.approx(off**2 + variance, rel=1e-3)
 
 
 def test_errors_of_held_boards_are_in_the_covariance_and_not_in_the_estimate():
@@ -185,16 +185,16 @@ def test_a_board_that_is_doubted_and_not_freed_counts_in_the_covariance(draws):
 @pytest.mark.slow
 def test_evidence_by_combinations_of_many_unknowns_is_the_same():
     fit = solve(made(stops=8, cameras=4).cell).fit
-    alone, boards = _errors_by_stop(fit, "flange"), _boards(fit)
-    assert fit.unknowns.count > 6 * len(alone.stops)
-    rows, sizes = alone.rows.reshape(-1, alone.rows.shape[2]), np.eye(fit.unknowns.count)
+    by_stop, boards = _errors_by_stop(fit, "flange"), _boards(fit)
+    assert fit.unknowns.count > 6 * len(by_stop.stops)
+    rows, sizes = by_stop.rows.reshape(-1, by_stop.rows.shape[2]), np.eye(fit.unknowns.count)
     found, values = [], []
-    grid, beside = _grid_of(fit, "flange", alone, creeps=True)
-    for tried in map(beside, grid):
-        full = alone.covariance(np.arange(8), tried.white)
+    grid, at_stops = _grid_of(fit, "flange", by_stop, creeps=True)
+    for tried in map(at_stops, grid):
+        full = by_stop.covariance(np.arange(8), tried.white)
         if tried.process is not None:
             full += tried.size**2 * tried.process.covariance(np.arange(8))
-        total = rows.T @ np.linalg.solve(full, rows) + alone.rest
+        total = rows.T @ np.linalg.solve(full, rows) + by_stop.rest
         known = replace(tried, total=total, boards=sizes[:, [one.column for one in boards]])
         for off in (0.0, 0.01, 0.1):
             found.append([*judged(tried, boards, off)[::2]])

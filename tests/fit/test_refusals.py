@@ -21,8 +21,8 @@ from visioncal.simulation import simulate
 
 def held(cell, first=0):
     """The cell whose sightings are predicted only, from one on."""
-    own = [replace(one, is_held=at >= first) for at, one in enumerate(cell.sightings)]
-    return cell.with_sightings(own)
+    sightings = [replace(one, is_held=at >= first) for at, one in enumerate(cell.sightings)]
+    return cell.with_sightings(sightings)
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -100,10 +100,10 @@ def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch, draws):
 
 def test_every_view_is_in_the_cell_or_reported_as_absent():
     small = made(stops=10)
-    own = list(small.cell.sightings)
-    line = own[3].corners.take(np.arange(len(own[3].corners.ids)) < 5)
-    own[3] = replace(own[3], evidence=line)
-    cell = solve(small.cell.with_sightings(own)).start.cell
+    sightings = list(small.cell.sightings)
+    line = sightings[3].corners.take(np.arange(len(sightings[3].corners.ids)) < 5)
+    sightings[3] = replace(sightings[3], evidence=line)
+    cell = solve(small.cell.with_sightings(sightings)).start.cell
     assert [one.view for one in cell.sightings] == [0, 1, 2, 4, 5, 6, 7, 8, 9]
     assert "in one row of the target" in cell.absent[3]
 
@@ -112,11 +112,11 @@ def test_every_view_is_in_the_cell_or_reported_as_absent():
 def test_a_lens_is_found_beside_views_of_one_row(draws):
     for seed in draws:
         small = made(seed, stops=24, given=False)
-        own = list(small.cell.sightings)
+        sightings = list(small.cell.sightings)
         for at in range(0, 24, 2):
             # All but one in a row: they have many homographies.
-            corners = own[at].corners
+            corners = sightings[at].corners
             kept = np.isin(corners.ids, [0, 1, 2, 5])
-            own[at] = replace(own[at], evidence=corners.take(kept))
-        lens = start_of(small.cell.with_sightings(own)).lenses["cam"]
+            sightings[at] = replace(sightings[at], evidence=corners.take(kept))
+        lens = start_of(small.cell.with_sightings(sightings)).lenses["cam"]
         assert lens.matrix[:2] == pytest.approx(TABLE.matrix[:2], rel=0.05)

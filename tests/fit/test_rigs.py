@@ -40,9 +40,9 @@ def test_arms_that_no_sighting_connects_are_eliminated_apart():
     simulated = simulate(OPTIONS)
     session = recorded(simulated)
     cell = read_cell(session, session.corners)
-    own = [s for s in cell.sightings if s.pair == ("cam_left", "target_plate_b")]
-    own += [s for s in cell.sightings if s.pair == ("cam_left", "target_plate_a")]
-    apart = cell.with_sightings(own)
+    sightings = [s for s in cell.sightings if s.pair == ("cam_left", "target_plate_b")]
+    sightings += [s for s in cell.sightings if s.pair == ("cam_left", "target_plate_a")]
+    apart = cell.with_sightings(sightings)
     assert sorted(apart.bodies) == [("flange_a",), ("flange_b",)]
     fit = solve(apart).fit
     assert [body.width for body in fit.mixed.bodies] == [6, 6]

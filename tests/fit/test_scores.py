@@ -113,14 +113,14 @@ def test_waves_have_the_covariance_of_a_smooth_field():
 
 def test_a_lens_that_breathes_is_likely_to_scatter():
     fit = solve(made(stops=10).cell).fit
-    (alone,) = [one for one in effects_of_lenses(fit) if one.kind == "focus jitter"]
+    (sole,) = [one for one in effects_of_lenses(fit) if one.kind == "focus jitter"]
     breathing = next(one for one in effects_of_lenses(fit) if one.kind == "breathing")
     unknowns = fit.unknowns.with_members(random_effect(breathing))
     unknowns = replace(unknowns, effects=(*unknowns.effects, breathing))
     logs = np.append(fit.estimate.logs, np.log(1e-3))
     wider = replace(fit, unknowns=unknowns, estimate=replace(fit.estimate, logs=logs))
-    beside = [one for one in effects_of_lenses(wider) if one.kind == "focus jitter"]
-    assert [one.size.limit < alone.size.limit for one in beside] == [True]
+    joint = [one for one in effects_of_lenses(wider) if one.kind == "focus jitter"]
+    assert [one.size.limit < sole.size.limit for one in joint] == [True]
     # A size that is held at its bound is none.
     closed = replace(wider, unknowns=unknowns.closing({breathing.name}))
     assert not any(one.size.limit < SIGNIFICANT for one in effects_of_lenses(closed))
@@ -148,8 +148,8 @@ def test_many_sightings_are_processed_in_parts(fit):
         linearised(fit.cell, fit.unknowns, fit.linearised, pairs) for pairs in (few, all_at_once)
     ]
     values = [
-        mixed_model(fit.cell, fit.unknowns, fit.linearised, own, fit.used).at(fit.estimate.logs)
-        for own in grams
+        mixed_model(fit.cell, fit.unknowns, fit.linearised, some, fit.used).at(fit.estimate.logs)
+        for some in grams
     ]
     assert values[0].value == pytest.approx(values[1].value, rel=1e-9)
     assert values[0].values == pytest.approx(values[1].values, rel=1e-5, abs=1e-9)

@@ -101,8 +101,8 @@ def test_a_chain_over_two_arms_is_within_the_stated_sigma():
         b = invert(edges["base_b"]) @ a @ edges["cam"] @ seen @ invert(edges["target"])
         noise = rng.normal(size=(2, stops, 6)) * np.repeat([2e-4, 1e-4], 3)
         arms = {
-            name: Arm(name, at @ exp(own))
-            for name, at, own in zip(("flange_a", "flange_b"), (a, b), noise, strict=True)
+            name: Arm(name, at @ exp(twists))
+            for name, at, twists in zip(("flange_a", "flange_b"), (a, b), noise, strict=True)
         }
         branches = {
             "base_a": Branch("cell", known=np.eye(4)),
@@ -165,13 +165,13 @@ def test_a_symmetric_board_is_numbered_as_its_first_view(monkeypatch, turned_fir
     half = rotations(board)[1]
     for seed in range(3):
         small = made(seed, stops=12)
-        own = list(small.cell.sightings)
+        sightings = list(small.cell.sightings)
         for at in [*range(0 if turned_first else 1, 12, 2)]:
-            corners = own[at].corners
-            own[at] = replace(own[at], evidence=replace(corners, ids=half[corners.ids]))
-        fit = solve(small.cell.with_sightings(own)).fit
+            corners = sightings[at].corners
+            sightings[at] = replace(sightings[at], evidence=replace(corners, ids=half[corners.ids]))
+        fit = solve(small.cell.with_sightings(sightings)).fit
         assert fit.used.all()
-        first = own[0].corners.ids
+        first = sightings[0].corners.ids
         assert np.array_equal(fit.cell.sightings[0].corners.ids, first)
         turn = rotation_transforms(board)[1] if turned_first else np.eye(4)
         away = log(invert(small.edges["target"] @ turn) @ fit.edge("target"))

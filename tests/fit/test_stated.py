@@ -52,8 +52,8 @@ def test_a_prior_counts_with_its_stated_sigma(draws):
         covariance = fit.covariance(("edge", "cam"))
         squares.append(away @ np.linalg.solve(covariance, away))
         assert np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])).max() < sigma
-        alone = solve(small.cell).fit.covariance(("edge", "cam"))
-        gains.append(np.trace(alone[3:, 3:]) / np.trace(covariance[3:, 3:]))
+        without = solve(small.cell).fit.covariance(("edge", "cam"))
+        gains.append(np.trace(without[3:, 3:]) / np.trace(covariance[3:, 3:]))
     assert is_fair(squares, 6)
     assert min(gains) > 1.0
 
@@ -99,11 +99,11 @@ def test_a_height_that_is_stated_of_a_base_leaves_its_turn_free():
     known = cell.with_sightings([*cell.sightings, Sighting(-1, 0, "base_a", "base_b", gauge)])
     found, before = (solve(one).fit for one in (known, cell))
     assert found.used[-1]
-    own, without = (fit.covariance(("edge", "base_b")) for fit in (found, before))
+    covariance, without = (fit.covariance(("edge", "base_b")) for fit in (found, before))
     # It adds to what is known, and holds nothing.
-    assert np.diag(own)[:3] == pytest.approx(np.diag(without)[:3], rel=0.5)
+    assert np.diag(covariance)[:3] == pytest.approx(np.diag(without)[:3], rel=0.5)
     turn = log(invert(away) @ found.edge("base_b"))
-    assert turn @ np.linalg.solve(own, turn) < 27.9  # one in ten thousand, of six
+    assert turn @ np.linalg.solve(covariance, turn) < 27.9  # one in ten thousand, of six
 
 
 def test_tables_become_sightings_of_one_component_each():
@@ -187,7 +187,7 @@ def test_a_refined_lens_without_a_sigma_is_found_from_the_corners():
 def test_small_sizes_that_chance_explains_count_as_their_posterior_says():
     fit = solve(made(4, 16).cell).fit
     bare = replace(fit, considered=None, shift=None)
-    own = fit.unknowns.columns("edge", "cam")
+    edge_columns = fit.unknowns.columns("edge", "cam")
     names = [name for name in bare.unknowns.closed if name.endswith(" cam")]
     assert names
     expected = np.zeros((6, 6))
@@ -212,12 +212,14 @@ def test_small_sizes_that_chance_explains_count_as_their_posterior_says():
         logs = np.array([(bare.estimate.value - one.value) / 2 for one in found])
         weights = np.exp(logs) / (np.exp(logs).sum() + len(logs))
         for one, weight in zip(found, weights, strict=True):
-            away = (one.values - bare.estimate.values)[own]
-            covariance = (one.covariance - bare.estimate.covariance)[own[:, None], own]
+            away = (one.values - bare.estimate.values)[edge_columns]
+            covariance = (one.covariance - bare.estimate.covariance)[
+                edge_columns[:, None], edge_columns
+            ]
             expected += weight * (covariance + np.outer(away, away))
     others = {name for name in bare.unknowns.closed if name not in names}
     only = replace(bare, unknowns=bare.unknowns.closing(set(bare.unknowns.closed) - others))
-    added = with_small_sizes(only).considered[own[:, None], own]
+    added = with_small_sizes(only).considered[edge_columns[:, None], edge_columns]
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert np.abs((added - expected) / scale).max() < 0.02
 
@@ -232,7 +234,7 @@ def test_a_stated_lens_leaves_without_its_field_as_matrix_and_distortion_explain
         bent.append(replace(sighting, evidence=replace(sighting.corners, px=px)))
     fit = solve(small.cell.with_sightings(bent)).fit
     field, values = fit.unknowns.fields["cam"], fit.state.values["field", "cam"]
-    lens, alone = fit.unknowns.camera(fit.state, "cam"), fit.camera("cam")
+    lens, bare = fit.unknowns.camera(fit.state, "cam"), fit.camera("cam")
     axes = (np.linspace(0.0, side - 1.0, 33) for side in lens.resolution)
     px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     rays = np.column_stack([(px - lens.matrix[2:]) / lens.matrix[:2], np.ones(len(px))])
@@ -241,13 +243,13 @@ def test_a_stated_lens_leaves_without_its_field_as_matrix_and_distortion_explain
     def left(camera):
         return float(np.mean((project(camera, rays) - seen - field.moved(px, values)) ** 2))
 
-    assert 1e-3 < left(alone) < left(lens)
+    assert 1e-3 < left(bare) < left(lens)
     # No change of matrix or distortion by which corners move by a tenth of a pixel is nearer.
     for column, step in enumerate(np.eye(9)):
         by = np.abs(by_lens(lens, px)[:, :, column]).max()
         for sign in (-1, 1):
-            other = with_intrinsics(alone, intrinsics(alone) + sign * 0.1 / by * step)
-            assert left(other) > left(alone)
+            other = with_intrinsics(bare, intrinsics(bare) + sign * 0.1 / by * step)
+            assert left(other) > left(bare)
 
 
 @pytest.mark.parametrize("draws", seeds(1, 8))

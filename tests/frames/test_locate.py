@@ -216,7 +216,7 @@ def test_a_place_that_cannot_be_located_is_refused_by_name(in_hand):
     middle, flange = np.array([[640.0, 400.0]]), at.base_from_flange
     base_from_cam = flange @ calibration.edges["flange_from_cam"].matrix
     origin, right, forward = (base_from_cam[:3, name] for name in (3, 0, 2))
-    level, behind, beside = (
+    level, behind, parallel = (
         Plane.through(forward, origin + forward),
         Plane.through(forward, origin - forward),
         Plane.through(right, origin + right),
@@ -226,7 +226,7 @@ def test_a_place_that_cannot_be_located_is_refused_by_name(in_hand):
         (r"eye-in-hand.*robot's pose", middle, level, None),
         (r"pixel \(1290.0, 400.0\) is outside .* 1280 x 800", [[1290.0, 400.0]], level, flange),
         ("outside", [[np.nan, 400.0]], level, flange),
-        ("parallel to the plane", centre, beside, flange),
+        ("parallel to the plane", centre, parallel, flange),
         (r"runs away from the plane: .* behind the camera", middle, behind, flange),
         ("millimetres", middle, level, compose(flange[:3, :3], 1e3 * flange[:3, 3])),
         ("rigid", middle, level, 2.0 * flange),
@@ -289,9 +289,9 @@ def test_corners_that_do_not_fit_are_left_out_refused_or_counted(in_hand):
 
 def test_a_stated_camera_beside_measured_poses_locates(tmp_path):
     cell = simulate(CellOptions(views=12))
-    told = Session.load(write_session(cell, tmp_path / "session", images=False))
+    session = Session.load(write_session(cell, tmp_path / "session", images=False))
     table = {"camera": session_of(cell).document["camera"]}
-    calibration = calibrate(replace(told, document=told.document | table))
+    calibration = calibrate(replace(session, document=session.document | table))
     stated = cell.options.camera
     np.testing.assert_array_equal(calibration.camera.camera.matrix, stated.matrix)
     assert not calibration.camera.estimated
@@ -382,10 +382,10 @@ def test_every_view_states_the_pose_of_the_target(cell):
         )
         assert place["budget_mm"]["total"] < 2.0
         assert place["warnings"] == []
-    told = done("locate", session, calibration=calibration, view=31)
-    assert told.startswith("view 31: (")
-    assert "95 % within" in told
-    assert told.count("\n") == 1
+    printed = done("locate", session, calibration=calibration, view=31)
+    assert printed.startswith("view 31: (")
+    assert "95 % within" in printed
+    assert printed.count("\n") == 1
     lost = run("locate", session, calibration=calibration).err
     assert ("view 33: no pose of the robot" in lost) == (not to_hand)
 
@@ -424,9 +424,9 @@ def test_pixels_are_placed_on_planes(cell):
         assert found["pixel"] == [700.0, 350.0]
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-12)
         np.testing.assert_allclose(found["covariance"], expected.covariance, atol=1e-18)
-    both = shown(pixel=[PIXEL, "600,500"], plane="z=-50", **given)
-    assert [value["pixel"] for value in both] == [[700.0, 350.0], [600.0, 500.0]]
-    assert "plane" not in both[0]["budget_mm"]
+    places = shown(pixel=[PIXEL, "600,500"], plane="z=-50", **given)
+    assert [value["pixel"] for value in places] == [[700.0, 350.0], [600.0, 500.0]]
+    assert "plane" not in places[0]["budget_mm"]
     # The jig's frame is the base's own, and not known exactly.
     for words in ("jig:z=-50", "base_from_jig:z=-50"):
         (found,) = shown(pixel=[PIXEL], plane=words, **given)
@@ -481,9 +481,9 @@ def test_a_frame_from_images_joins_the_calibration(tmp_path):
     calibration.save(tmp_path / "calibration.json")
     pictured(cell, shots(cell, 4)).save(tmp_path / "part")
     at = {"calibration": tmp_path}
-    told = done("tcp", tmp_path / "part", **at, name="gripper", point="0,0,-120")
-    assert told.startswith("good  flange_from_gripper")
-    assert "its point (0, 0, -120) mm" in told
+    printed = done("tcp", tmp_path / "part", **at, name="gripper", point="0,0,-120")
+    assert printed.startswith("good  flange_from_gripper")
+    assert "its point (0, 0, -120) mm" in printed
     kept = Calibration.load(tmp_path).frames["flange_from_gripper"]
     true = cell.transforms["flange_from_target"]
     tip = true[:3, 3] - 0.12 * true[:3, 2]
@@ -491,8 +491,8 @@ def test_a_frame_from_images_joins_the_calibration(tmp_path):
     assert 1e3 * np.linalg.norm(kept.edge.matrix[:3, 3] - tip) < 4 * kept.edge.sigma_mm
     assert "flange_from_gripper" in (tmp_path / "report.html").read_text(encoding="utf-8")
     file = tmp_path / "frames.json"
-    told = done("tcp", tmp_path / "part", "--json", **at, out=file)
-    assert json.loads(told).keys() == {"flange_from_tool"}
+    printed = done("tcp", tmp_path / "part", "--json", **at, out=file)
+    assert json.loads(printed).keys() == {"flange_from_tool"}
     assert FrameFile.load(file).frames.keys() == {"flange_from_tool"}
 
 

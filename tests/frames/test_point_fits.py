@@ -322,11 +322,11 @@ def test_a_group_that_alone_determines_a_direction_is_not_accused():
     problem = lines(5)
     jacobian = problem.jacobian.copy()
     jacobian[1:, :, 5] = 0.0
-    alone = Lines(jacobian, jacobian @ TRUTH, problem.observed, problem.known)
+    lopsided = Lines(jacobian, jacobian @ TRUTH, problem.observed, problem.known)
     noise = SIGMA * np.random.default_rng(6).standard_normal((10, 3))
-    alone = shifted(alone, slice(None), noise)
+    lopsided = shifted(lopsided, slice(None), noise)
     # An error along the direction that only the first group sees is a change of the unknown.
-    found = find_inlier_groups(shifted(alone, 0, jacobian[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
+    found = find_inlier_groups(shifted(lopsided, 0, jacobian[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
     assert found.mask.all()
     assert found.fit.state[5] == pytest.approx(TRUTH[5] + 0.05, abs=20 * SIGMA)
 

@@ -96,15 +96,15 @@ def test_jacobians_of_a_sight_agree_with_central_differences(mount, parent):
         flange = sight.base_from_flange @ exp(twist)
         return placed(sight=replace(sight, base_from_flange=flange)).matrix
 
-    here = placed()
-    np.testing.assert_allclose(here.matrix, place, atol=1e-8)
+    sighted = placed()
+    np.testing.assert_allclose(sighted.matrix, place, atol=1e-8)
     steps = 1e-2 * np.array([*[1e-3] * 6, *[1.0] * 4, *[1e-3] * 5])
     # The fit of a pose stops at steps of 1e-6, whose next ones are a hundred times smaller.
     moved = twists(with_step, 15, 1.0)
-    np.testing.assert_allclose(here.by_common[:, :15] * steps, moved, atol=3e-8)
-    by_size = here.by_common[:, len(eye.covariance)]
+    np.testing.assert_allclose(sighted.by_common[:, :15] * steps, moved, atol=3e-8)
+    by_size = sighted.by_common[:, len(eye.covariance)]
     np.testing.assert_allclose(by_size, twists(of_size, 1, 1e-4)[:, 0], atol=1e-4)
-    np.testing.assert_allclose(here.flange_jacobian, twists(standing, 6, 1e-4), atol=1e-6)
+    np.testing.assert_allclose(sighted.flange_jacobian, twists(standing, 6, 1e-4), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -130,10 +130,12 @@ def test_views_from_several_sides_show_the_size_of_a_target(draws):
         cell, calibration = calibrated(IN_HAND, seed % 4)
         rng = np.random.default_rng(seed)
         # As unsure as a label that is measured with a ruler.
-        told = replace(BOARD, square_sigma_m=3e-3 * BOARD.square_m)
-        true = replace(told, square_m=BOARD.square_m + told.square_sigma_m * rng.normal())
+        stated = replace(BOARD, square_sigma_m=3e-3 * BOARD.square_m)
+        true = replace(stated, square_m=BOARD.square_m + stated.square_sigma_m * rng.normal())
         place = place_of(cell, "base", rng)
-        found = place_seen(calibration, sights_of(cell, "base", place, rng, 8, true), told, "base")
+        found = place_seen(
+            calibration, sights_of(cell, "base", place, rng, 8, true), stated, "base"
+        )
         surprises.append(misfit(found, place) / 6)
         sigmas.append(found.edge.sigma_mm)
     # At 0.6 m, the size alone would leave 1.8 mm in an image.
@@ -336,16 +338,16 @@ def test_views_that_show_nothing_are_named():
     assert "role = holdout" in reasons["35"]
     assert "no pose of the robot" in reasons["36"]
     # What is held back on purpose is no loss.
-    (told,) = (reason for reason in frame.verdict.reasons if "views were not used" in reason)
-    assert told.startswith("3 of 7 views")
+    (words,) = (reason for reason in frame.verdict.reasons if "views were not used" in reason)
+    assert words.startswith("3 of 7 views")
 
 
 def test_one_image_or_one_stop_is_no_check():
     cell, calibration = calibrated_cell(IN_HAND)
-    alone = seen_frame(session_of(cell, shots(cell, 1)), calibration, "fixture")
-    assert alone.verdict.status == "check"
-    assert "nothing checks it" in alone.verdict.reasons[0]
-    assert alone.noise_mm > 0.0
+    single = seen_frame(session_of(cell, shots(cell, 1)), calibration, "fixture")
+    assert single.verdict.status == "check"
+    assert "nothing checks it" in single.verdict.reasons[0]
+    assert single.noise_mm > 0.0
     same = seen_frame(session_of(cell, [shots(cell, 1)[0]] * 4), calibration, "fixture")
     assert "of one stop of the robot" in same.verdict.reasons[0]
     moved = [

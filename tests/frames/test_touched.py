@@ -259,8 +259,8 @@ def test_a_plane_has_a_hand_by_the_side_that_it_was_touched_from():
         size=FLAT_MM.shape
     )
     cad = drawing(1e-3 * FLAT_MM)
-    alone = touched_fixture(touch_rows(poses, points=NAMES[:5]), None, cad)
-    assert "a mirrored drawing would fit them as well" in alone.verdict.reasons[0]
+    by_points = touched_fixture(touch_rows(poses, points=NAMES[:5]), None, cad)
+    assert "a mirrored drawing would fit them as well" in by_points.verdict.reasons[0]
 
 
 def test_few_noisy_or_uncertain_points_are_doubted():
@@ -318,7 +318,7 @@ def test_errors_that_points_share_are_carried_to_the_answer():
 @pytest.fixture
 def tool_file(tmp_path):
     path = tmp_path / "frames.json"
-    made.alone(made.tool()).save(path)
+    made.frame_file(made.tool()).save(path)
     return path
 
 
@@ -423,7 +423,9 @@ def test_a_drawings_own_sigma_counts(tmp_path, tool_file):
 def test_the_tool_that_touched_is_named_or_found(tmp_path, tool_file):
     cad, touches = cad_file(tmp_path / "cad.csv"), touches_file(tmp_path / "touches.csv")
     two = tmp_path / "two.json"
-    made.alone({"flange_from_gripper": made.frame(made.FLANGE_FROM_TOOL), **made.tool()}).save(two)
+    made.frame_file({"flange_from_gripper": made.frame(made.FLANGE_FROM_TOOL), **made.tool()}).save(
+        two
+    )
 
     def run(*more):
         return visioncal("fixture", touches, "--cad", cad, *more)

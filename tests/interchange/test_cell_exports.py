@@ -13,7 +13,7 @@ import yaml
 from support import placed
 from support.aligned_cells import made_up_cell, with_cell
 from support.arm_documents import arm_of
-from support.placed import alone, tool
+from support.placed import frame_file, tool
 from support.readers import ARM_FORMATS, rx, ry, rz, transform
 from support.refusals import raised
 from support.samples import made_up
@@ -206,7 +206,7 @@ def test_the_file_says_where_it_comes_from(name):
 @pytest.mark.parametrize("name", ARM_FORMATS)
 @pytest.mark.parametrize(
     "source",
-    [SAMPLE, replace(SAMPLE, arm=ArmResult(level="nominal", levels=())), alone(tool())],
+    [SAMPLE, replace(SAMPLE, arm=ArmResult(level="nominal", levels=())), frame_file(tool())],
     ids=["none", "nominal", "frames"],
 )
 def test_without_a_calibrated_arm_the_next_step_is_reported(name, source):

@@ -50,7 +50,7 @@ TINY = {("tiny", name) for name in ("doosan", "kawasaki", "comau")}
 RNG = np.random.default_rng(3)
 SAMPLE = replace(made_up(5).calibration, frames={})
 CELL = replace(SAMPLE, frames=tool() | fixture(source="points.csv"))
-ALONE = placed.alone(tool(), fixture())
+ALONE = placed.frame_file(tool(), fixture())
 
 
 def calibration(matrix, mount="eye-in-hand", **changes):
@@ -86,7 +86,7 @@ def test_the_exported_transform_is_read_back(name):
             # What a lens would be warned of takes longer than all else.
             found = calibration(matrix, ("eye-in-hand", "eye-to-hand")[at % 2], camera=None)
             if name in FRAME_READERS:
-                found = placed.alone(tool(matrix) if name in TOOL_READERS else fixture(matrix))
+                found = placed.frame_file(tool(matrix) if name in TOOL_READERS else fixture(matrix))
             assert off(name, export(found, name, wanted(name)), matrix) < tolerance, kind
 
 
@@ -94,8 +94,8 @@ def test_the_exported_transform_is_read_back(name):
 def test_any_edge_and_frame_and_its_inverse_are_exported(name):
     edges = {edge: found.matrix for edge, found in SAMPLE.edges.items()}
     frames = {TOOL: FLANGE_FROM_TOOL, FIXTURE: BASE_FROM_FIXTURE}
-    for source, there in ((SAMPLE, edges), (CELL, frames), (ALONE, frames)):
-        for edge, matrix in there.items():
+    for source, matrices in ((SAMPLE, edges), (CELL, frames), (ALONE, frames)):
+        for edge, matrix in matrices.items():
             # As above.
             assert off(name, export(source, name, Selection(edge=edge)), matrix) < 1e-9
             inverse = export(source, name, Selection(edge=edge, inverse=True))
@@ -103,18 +103,21 @@ def test_any_edge_and_frame_and_its_inverse_are_exported(name):
 
 
 def test_the_depth_camera_is_a_frame_of_the_tree():
-    beside = compose(
+    depth_pose = compose(
         exp(np.array([0.01, -0.03, 0.005, 0, 0, 0]))[:3, :3], np.array([0.05, 0, 0.01])
     )
     lens = SAMPLE.camera.camera
     depth = DepthResult(
         scale=1.0, offset_m=0.0, tilt_m=(0.0, 0.0), bowl_m=0.0, covariance=np.eye(5) * 1e-8,
         noise_m=(0.0, 1e-3), view_m=0.0, distances_m=(0.3, 1.0),
-        by=DepthCamera(**vars(lens), cam_from_depth=beside, sigmas=(1e-3, 2e-4)),
+        by=DepthCamera(**vars(lens), cam_from_depth=depth_pose, sigmas=(1e-3, 2e-4)),
     )  # fmt: skip
     source = replace(SAMPLE, camera=replace(SAMPLE.camera, depth=depth))
     x = SAMPLE.edges["flange_from_cam"].matrix
-    for name, matrix in (("cam_from_depth", beside), ("flange_from_depth", x @ beside)):
+    for name, matrix in (
+        ("cam_from_depth", depth_pose),
+        ("flange_from_depth", x @ depth_pose),
+    ):
         for to in ("ros", "urdf", "kuka", "text"):
             assert off(to, export(source, to, Selection(edge=name)), matrix) < 1e-9
     stated = yaml.safe_load(export(source, "ros", Selection(edge="cam_from_depth")))
@@ -122,8 +125,8 @@ def test_the_depth_camera_is_a_frame_of_the_tree():
     assert stated["child_frame_id"] == "camera_depth_optical_frame"
     text = export(source, "text", Selection(edge="flange_from_depth"))
     sigma_mm = float(text.partition("sigma ")[2].split()[0])
-    spread = log(invert(x @ beside) @ x @ exp(RNG.multivariate_normal(
-        np.zeros(6), SAMPLE.edges["flange_from_cam"].covariance, 20_000)) @ beside)  # fmt: skip
+    spread = log(invert(x @ depth_pose) @ x @ exp(RNG.multivariate_normal(
+        np.zeros(6), SAMPLE.edges["flange_from_cam"].covariance, 20_000)) @ depth_pose)  # fmt: skip
     spread = spread + RNG.standard_normal(spread.shape) * np.repeat([1e-3, 2e-4], 3)
     worth = 1e3 * np.sqrt(np.trace(np.cov(spread[:, 3:].T)))
     assert sigma_mm == pytest.approx(worth, rel=0.06)  # of two digits
@@ -276,7 +279,7 @@ def test_easy_handeye_has_all_fields_that_its_readers_take(mount):
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    own = {
+    fields = {
         "easy-handeye": {"namespace": "/visioncal/", "eye_on_hand": in_hand},
         "easy-handeye2": {
             "name": "visioncal",
@@ -284,7 +287,7 @@ def test_easy_handeye_has_all_fields_that_its_readers_take(mount):
             "freehand_robot_movement": True,
         },
     }
-    for name, more in own.items():
+    for name, more in fields.items():
         text = export(calibration(np.eye(4), mount), name, Selection(parent="mine", child="eye"))
         assert yaml.safe_load(text)["parameters"] == common | more
 
@@ -552,7 +555,7 @@ def test_the_gripper_of_abbs_manual_is_written_as_printed():
     # The manual's quaternion has three digits, by which a matrix is off by up to four times that.
     assert off("abb-tooldata", GRIPPER, matrix) < 2e-3
     chosen = Selection(child="gripper", mass_kg=5.0, cog_mm=(23.0, 0.0, 75.0))
-    ours = export(placed.alone(tool(matrix)), "abb-tooldata", chosen)
+    ours = export(placed.frame_file(tool(matrix)), "abb-tooldata", chosen)
     kind, name, (held, (position, quaternion), load) = readers.rapid(ours)
     assert (kind, name) == readers.rapid(GRIPPER)[:2]
     theirs = readers.rapid(GRIPPER)[2]
@@ -565,7 +568,7 @@ def test_the_work_object_of_abbs_manual_is_written_as_printed():
     # Rounding of doubles.
     assert off("abb-wobjdata", WOBJ2, readers.transform(np.eye(3), [0.3, 0.8, 0.23])) < 1e-12
     user = readers.transform(np.eye(3), [0.3, 0.6, 0.2])
-    ours = export(placed.alone(fixture(user)), "abb-wobjdata", Selection(child="wobj2"))
+    ours = export(placed.frame_file(fixture(user)), "abb-wobjdata", Selection(child="wobj2"))
     kind, name, value = readers.rapid(WOBJ2)
     # All of the fixture goes into the user frame; the object's own is left where it is.
     assert readers.rapid(ours) == (kind, name, [*value[:4], [[0, 0, 0], [1, 0, 0, 0]]])
@@ -575,10 +578,10 @@ def test_tool_and_pose_of_urs_script_manual_are_written_as_printed():
     matrix = readers.transform(readers.of_rotation_vector(0, 3.14, 0), [0, 0.2, 0.3])
     # Rounding of doubles.
     assert off("ur-tcp", SET_TCP, matrix) < 1e-12
-    assert rounded(export(placed.alone(tool(matrix)), "ur-tcp"), "#") == rounded(SET_TCP, "#")
+    assert rounded(export(placed.frame_file(tool(matrix)), "ur-tcp"), "#") == rounded(SET_TCP, "#")
     pose = readers.transform(readers.rx(1.57), [0.2, 0.5, 0.1])
     assert np.abs(readers.urscript_pose(POSE) - pose).max() < 1e-12
-    ours = export(placed.alone(fixture(pose)), "ur-feature", Selection(child="p_from"))
+    ours = export(placed.frame_file(fixture(pose)), "ur-feature", Selection(child="p_from"))
     assert rounded(ours, "#") == rounded(f"globalp_from={POSE}", "#")
 
 
@@ -588,9 +591,9 @@ def test_tool_and_pose_of_urs_script_manual_are_written_as_printed():
 def test_kuka_frames_of_a_controllers_file_are_written_as_there(name, theirs, number):
     matrix = FRAME_READERS[name](theirs)
     frames = tool(matrix) if name == "kuka-tool" else fixture(matrix)
-    ours = export(placed.alone(frames), name, Selection(number=number))
+    ours = export(placed.frame_file(frames), name, Selection(number=number))
     assert rounded(ours, ";") == rounded(theirs, ";")
-    active = export(placed.alone(frames), name)
+    active = export(placed.frame_file(frames), name)
     assert readers.kuka_named(active)[0] == ("$TOOL" if name == "kuka-tool" else "$BASE")
 
 
@@ -636,7 +639,7 @@ def test_fanuc_frames_of_a_controllers_program_are_written_as_there():
     assert theirs["UTOOL[2]"][:3, 3].tolist() == [0, 0, 0.15]
     long = placed.frame(theirs["UTOOL[2]"], oriented=False)
     frames = {"flange_from_a_tool_with_a_very_long_name": long}
-    text = export(placed.alone(frames), "fanuc-utool", Selection(number=2))
+    text = export(placed.frame_file(frames), "fanuc-utool", Selection(number=2))
     assert np.array_equal(readers.fanuc_program(text)["UTOOL[2]"], theirs["UTOOL[2]"])
     assert text.startswith("/PROG  SET_UT2\r\n")
 
@@ -839,9 +842,9 @@ CASE = Path(__file__).parents[3] / "shared/data/field/cases/camera-link-export/c
 @pytest.mark.skipif(not CASE.is_file(), reason="the case is not beside this checkout")
 def test_cases_of_public_threads_are_answered(tmp_path):
     SAMPLE.save(tmp_path / "calibration.json")
-    told = CASE.read_text(encoding="utf-8")
+    thread = CASE.read_text(encoding="utf-8")
     xyz, rpy = (
-        list(map(float, re.search(rf"{word} \(([^)]*)\)", told)[1].split(",")))
+        list(map(float, re.search(rf"{word} \(([^)]*)\)", thread)[1].split(",")))
         for word in ("xyz", "rpy")
     )
     # As a URDF has them: about fixed x, y, z.

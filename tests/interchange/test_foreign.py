@@ -142,15 +142,15 @@ def test_samples_are_found_in_their_folder_with_the_mount_beside_them(tmp_path):
 
 def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
     robot, camera = quaternions(BASE_FROM_FLANGE).tolist(), quaternions(CAM_FROM_TARGET).tolist()
-    own = ["a", "b", "c", "d", "e", "f", "g"]
+    robot_names = ["a", "b", "c", "d", "e", "f", "g"]
     extra = {"role": "tester", "stop": "emergency", "temp1_c": "warm", "camera": "", "q1_rad": "1"}
-    text = ",".join([*own, *(f"cft_{name}" for name in POSE), *extra, "group"]) + "\n"
+    text = ",".join([*robot_names, *(f"cft_{name}" for name in POSE), *extra, "group"]) + "\n"
     for at, row in enumerate(np.hstack([robot, camera]).tolist()):
         cells = [*map(repr, row), *(extra | {"camera": f"cam {at % 2}"}).values(), "warm-up"]
         text += ",".join(cells) + "\n"
     (tmp_path / "log.csv").write_text(text)
     requested = ImportOptions(
-        mount="eye-in-hand", robot=PoseImportOptions(tuple(own), unit="m"), joints=("a",)
+        mount="eye-in-hand", robot=PoseImportOptions(tuple(robot_names), unit="m"), joints=("a",)
     )
     session = convert(tmp_path / "log.csv", tmp_path / "out", requested=requested)
     assert {f"source_{name}" for name in extra} < set(session.columns)
@@ -545,8 +545,8 @@ def test_a_translation_called_t_is_no_time(rows):
         return place | {"rvec": vector(BASE_FROM_FLANGE[at])["rvec"]}
 
     for fields, names in ((apart, ("t", "R")), (single, ("t", "x", "y", "rvec"))):
-        asked = replace(HAND, robot=PoseImportOptions(names))
-        assert read_foreign(rows(fields), asked).stamps_s is None
+        options = replace(HAND, robot=PoseImportOptions(names))
+        assert read_foreign(rows(fields), options).stamps_s is None
     timed = rows(lambda at: {"t": 0.5 * at, "robot_pose": BASE_FROM_FLANGE[at].tolist()})
     assert read_foreign(timed, HAND).stamps_s[2] == 1.0
 
@@ -561,20 +561,20 @@ def test_twelve_numbers_are_read_in_the_order_that_makes_rotations(table):
 
 
 def test_the_robots_fields_are_not_the_cameras_as_well(rows):
-    alone = rows(lambda at: vector(BASE_FROM_FLANGE[at]))
+    robot_only = rows(lambda at: vector(BASE_FROM_FLANGE[at]))
     requested = replace(HAND, robot=PoseImportOptions(("tvec", "rvec")))
-    assert read_foreign(alone, requested).camera is None
-    both = rows(
+    assert read_foreign(robot_only, requested).camera is None
+    two_sides = rows(
         lambda at: {"robot": vector(BASE_FROM_FLANGE[at]), "board": vector(CAM_FROM_TARGET[at])}
     )
     named = replace(HAND, robot=PoseImportOptions(("robot.tvec", "robot.rvec")))
-    found = read_foreign(both, named)
+    found = read_foreign(two_sides, named)
     # One conversion to a vector and back, in double precision.
     np.testing.assert_allclose(found.camera.poses(), CAM_FROM_TARGET, atol=1e-14)
     # Of equal names, those under a side's own word are its.
     same = PoseImportOptions(("tvec", "rvec"))
     for whose, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
-        found = getattr(read_foreign(both, replace(HAND, robot=same, camera=same)), whose)
+        found = getattr(read_foreign(two_sides, replace(HAND, robot=same, camera=same)), whose)
         np.testing.assert_allclose(found.poses(), poses, atol=1e-14)
     other = rows(
         lambda at: {"first": vector(BASE_FROM_FLANGE[at]), "other": vector(CAM_FROM_TARGET[at])}

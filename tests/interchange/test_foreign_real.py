@@ -259,8 +259,8 @@ def test_a_pan_tilt_head_of_a_urdf_of_any_name(real_data, tmp_path):
     joints = ("--joint-columns", "pan_joint,tilt_joint", "--camera-columns", seen)
     convert(case / "pantilt.csv", out, *arm, *joints).good()
     # The names of its joints find the URDF that stands beside the table, its end the tip.
-    beside = convert(case, tmp_path / "found", "--mount=eye-in-hand").good()
-    assert "pan_joint, tilt_joint are the joints of ptu.urdf, to its tilt" in beside.err
+    converted = convert(case, tmp_path / "found", "--mount=eye-in-hand").good()
+    assert "pan_joint, tilt_joint are the joints of ptu.urdf, to its tilt" in converted.err
     found, stated = ((tmp_path / name / "views.csv").read_text() for name in ("found", "s"))
     assert found == stated
     assert 'tip = "tilt"' in (tmp_path / "found/session.toml").read_text()

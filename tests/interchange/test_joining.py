@@ -99,9 +99,9 @@ def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, 
     kept = FrameFile.load(out / "frames.json").frames
     assert kept.keys() == {"flange_from_old", *frames}
     assert kept["base_from_fixture"].details[SEEN_BY] == "yesterday"
-    told = capsys.readouterr().err
-    assert "flange_from_tool, base_from_fixture had joined the result that this one" in told
-    assert "calibrated before: base_from_fixture." in told
+    printed = capsys.readouterr().err
+    assert "flange_from_tool, base_from_fixture had joined the result that this one" in printed
+    assert "calibrated before: base_from_fixture." in printed
 
 
 def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):

@@ -406,12 +406,12 @@ def poses_as_texts(folder):
     shoot(folder / "grabs", "grab-{:02d}.png")
     lines = [{"ev": "boot", "fw": "5.9.4"}]
     for at, row in enumerate(vectors(1.0)):
-        asked, there = (
+        target, reached = (
             f"p[{', '.join(f'{n:.12f}' for n in [*(row[:3] + off), *row[3:]])}]"
             for off in (0.02 * at, 0)
         )
-        seen = {"file": f"grab-{at:02d}.png", "actual_flange": there, "q": [1.0] * 6}
-        lines += [{"ev": "move", "target": asked}, {"ev": "grab", **seen}]
+        seen = {"file": f"grab-{at:02d}.png", "actual_flange": reached, "q": [1.0] * 6}
+        lines += [{"ev": "move", "target": target}, {"ev": "grab", **seen}]
     write(folder / "events.jsonl", "\n".join(map(json.dumps, lines)))
 
 
@@ -1435,8 +1435,8 @@ def test_the_numbers_of_one_side_never_serve_as_both(tmp_path, monkeypatch, is_i
     """They agree with each other to the last digit, and say nothing of the camera."""
     monkeypatch.chdir(tmp_path)
     poses, _, session = world()
-    both = np.array([poses, np.linalg.inv(poses) if is_inverse else poses])
-    records = [{"pose": a.tolist(), "board": b.tolist()} for a, b in both.swapaxes(0, 1)]
+    sides = np.array([poses, np.linalg.inv(poses) if is_inverse else poses])
+    records = [{"pose": a.tolist(), "board": b.tolist()} for a, b in sides.swapaxes(0, 1)]
     write(tmp_path / "in.json", json.dumps(records))
     said = ("--mount", "eye-in-hand", "--robot-key", "pose", "--camera-key", "board")
     for more in ((), ("--guess", "--yes")):
@@ -1447,7 +1447,7 @@ def test_the_numbers_of_one_side_never_serve_as_both(tmp_path, monkeypatch, is_i
     Session.assemble(
         {"schema": 1, "name": "out", "mount": "eye-in-hand"},
         ["view", *POSE, *MEASURED_CAM_POSE],
-        [[*map(str, (at, *seven(a), *seven(b)))] for at, (a, b) in enumerate(both.swapaxes(0, 1))],
+        [[*map(str, (at, *seven(a), *seven(b)))] for at, (a, b) in enumerate(sides.swapaxes(0, 1))],
         session.images,
     ).save(tmp_path / "out")
     assert "serve as both" in visioncal("calibrate", "out").refused().err
@@ -1511,34 +1511,34 @@ def test_structures_and_cells_of_matlab_are_read(tmp_path):
 
 def test_arrays_that_are_numbered_are_series_and_no_rows(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    both, mount = pairs()
-    np.savez("in.npz", series_1=both[0], series_2=both[1])
+    sides, mount = pairs()
+    np.savez("in.npz", series_1=sides[0], series_2=sides[1])
     follow("convert", "in.npz", "out", "--mount", mount).last.good()
-    np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
+    np.testing.assert_allclose(came_in(Session.load("out")), sides, atol=1e-9)
 
 
 def test_a_series_is_named_that_is_not_read(tmp_path, monkeypatch):
     """One in which the robot stands still is not read, however well both sides agree."""
     monkeypatch.chdir(tmp_path)
-    both, mount = pairs()
-    records = [{"T_base_ee": a, "T_cam_board": b} for a, b in both.swapaxes(0, 1).tolist()]
+    sides, mount = pairs()
+    records = [{"T_base_ee": a, "T_cam_board": b} for a, b in sides.swapaxes(0, 1).tolist()]
     write(tmp_path / "in.json", {"first": records[:1] * 8, "second": records})
     done = visioncal("convert", "in.json", "out", "--mount", mount).good()
     assert "second is read; left aside: first (8 rows)" in done.err
-    np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
+    np.testing.assert_allclose(came_in(Session.load("out")), sides, atol=1e-9)
 
 
 def test_pictures_of_the_lens_do_not_change_pairs_that_do_not_fit(tmp_path):
     """Pairs of which no reading fits come in as they are, whatever pictures may be theirs."""
-    both, mount = pairs()
+    sides, mount = pairs()
     for at in range(1, 14):
         shoot_one(tmp_path / f"in/lens/shot_{at:02d}.png", at % 9)
-    tossed = np.random.default_rng(0).permutation(both[1])
-    np.savez(tmp_path / "in/pairs.npz", T_base_ee=both[0], T_cam_board=tossed)
+    tossed = np.random.default_rng(0).permutation(sides[1])
+    np.savez(tmp_path / "in/pairs.npz", T_base_ee=sides[0], T_cam_board=tossed)
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", mount).good()
     assert "The images are left aside" in done.err
     np.testing.assert_allclose(
-        came_in(Session.load(tmp_path / "out")), [both[0], tossed], atol=1e-9
+        came_in(Session.load(tmp_path / "out")), [sides[0], tossed], atol=1e-9
     )
 
 
@@ -1572,8 +1572,8 @@ def test_series_of_pictures_in_several_files_are_converted_one_by_one(tmp_path):
     poses, pictures, session = world()
     for at in range(3):
         part = slice(3 * at, 3 * at + 3)
-        both = {"rgb": np.array(pictures[part]), "depth_image": np.array(pictures[part])}
-        np.savez(tmp_path / f"run_{at}.npz", T_base_ee=poses[part], **both)
+        arrays = {"rgb": np.array(pictures[part]), "depth_image": np.array(pictures[part])}
+        np.savez(tmp_path / f"run_{at}.npz", T_base_ee=poses[part], **arrays)
     said = ("--target", session.document["target"], "--mount", "eye-in-hand")
     error = visioncal("convert", tmp_path, tmp_path / "out", *said).refused().err
     assert "'rgb' (3 x 400 x 640), 'depth_image' (3 x 400 x 640), but" in error
@@ -1585,9 +1585,9 @@ def test_an_undeclared_board_is_the_one_that_the_images_show(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     stems_with_depth(tmp_path / "in")
     advised = visioncal("calibrate", "in").refused("asked for where no file beside").err
-    asked = visioncal(*shlex.split(advised.partition("visioncal ")[2].partition(" && ")[0]))
-    asked.refused("is not stated: a ChArUco board of 9 x 6 squares")
-    command = next(line for line in asked.err.splitlines() if line.startswith("visioncal target"))
+    refused = visioncal(*shlex.split(advised.partition("visioncal ")[2].partition(" && ")[0]))
+    refused.refused("is not stated: a ChArUco board of 9 x 6 squares")
+    command = next(line for line in refused.err.splitlines() if line.startswith("visioncal target"))
     visioncal(*shlex.split(command)[1:]).good()
     visioncal("convert", "in", "out", "--target", "board.toml", "--mount", "eye-in-hand").good()
     found = [view.base_from_flange().as_matrix() for view in Session.load("out").views]
@@ -1597,12 +1597,12 @@ def test_an_undeclared_board_is_the_one_that_the_images_show(tmp_path, monkeypat
 @pytest.mark.parametrize("has_matrices", [False, True])
 def test_alternating_rows_of_both_sides_are_read_without_names(tmp_path, has_matrices):
     """Even and odd rows turn alike; of a pose that was written twice they are copies."""
-    both, mount = pairs()
-    quaternions = Rotation.from_matrix(both[..., :3, :3]).as_quat()
-    rows = both.reshape(2, -1, 16) if has_matrices else np.dstack([both[..., :3, 3], quaternions])
+    sides, mount = pairs()
+    quaternions = Rotation.from_matrix(sides[..., :3, :3]).as_quat()
+    rows = sides.reshape(2, -1, 16) if has_matrices else np.dstack([sides[..., :3, 3], quaternions])
     np.savetxt(tmp_path / "in.txt", rows.swapaxes(0, 1).reshape(-1, rows.shape[2]), fmt="%.12f")
     visioncal("convert", tmp_path / "in.txt", tmp_path / "out", "--mount", mount).good()
-    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
+    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), sides, atol=1e-9)
     np.savetxt(tmp_path / "twice.txt", np.repeat(rows[0], 2, axis=0))
     twice = visioncal("convert", tmp_path / "twice.txt", tmp_path / "two", "--mount", mount)
     twice.refused("18 poses of the robot, but neither images nor poses of the target")
@@ -1630,8 +1630,10 @@ def test_poses_of_the_board_are_not_taken_for_the_robot_s(tmp_path):
         cv2.imwrite(str(tmp_path / f"in/images/image_{at + 1}.png"), picture)
     np.save(tmp_path / "in/board2camera.npy", seen)
     said = ("--target", session.document["target"])
-    alone = visioncal("convert", tmp_path / "in", tmp_path / "out", *said, "--mount", "eye-to-hand")
-    alone.refused("are those of the camera over the board", "--robot-key")
+    refused = visioncal(
+        "convert", tmp_path / "in", tmp_path / "out", *said, "--mount", "eye-to-hand"
+    )
+    refused.refused("are those of the camera over the board", "--robot-key")
     np.save(tmp_path / "in/ee2base.npy", [*poses, *poses[[2, 5]]])
     source, mount = tmp_path / "in", ("--mount", "eye-in-hand")
     visioncal("convert", source, tmp_path / "out", *said, *mount).good()
@@ -1657,12 +1659,12 @@ def test_angles_of_two_runs_are_no_sides(tmp_path):
 
 @pytest.mark.parametrize("names", [("g2b", "t2c"), ("b2e", "o2c")])
 def test_poses_are_read_by_the_initials_of_their_frames(tmp_path, names):
-    both, mount = pairs()
-    robot = both[0] if names[0] == "g2b" else np.linalg.inv(both[0])
-    arrays = {f"T_{names[1]}": both[1], f"T_{names[0]}": robot, "T_c2g": np.eye(4)}
+    sides, mount = pairs()
+    robot = sides[0] if names[0] == "g2b" else np.linalg.inv(sides[0])
+    arrays = {f"T_{names[1]}": sides[1], f"T_{names[0]}": robot, "T_c2g": np.eye(4)}
     np.savez(tmp_path / "in.npz", **arrays)
     visioncal("convert", tmp_path / "in.npz", tmp_path / "out", "--mount", mount).good()
-    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
+    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), sides, atol=1e-9)
 
 
 def test_points_of_a_camera_are_read_from_a_file_beside_the_robot_s_poses(tmp_path):
@@ -1688,9 +1690,9 @@ def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_on
     theirs = (ours - truth[:3, 3]) @ truth[:3, :3] + rng.normal(scale=2e-4, size=ours.shape)
     if is_one_file:
         names = [f"{side}_{axis}" for side in ("cam", "gt") for axis in "xyz"]
-        both = {"camera": theirs, "robot": ours}
+        sides = {"camera": theirs, "robot": ours}
         records = [
-            {side: dict(zip("xyz", each[at].tolist(), strict=True)) for side, each in both.items()}
+            {side: dict(zip("xyz", each[at].tolist(), strict=True)) for side, each in sides.items()}
             for at in range(12)
         ]
         # No poses, and rows whose names count.
@@ -1748,9 +1750,9 @@ def test_quaternions_without_their_real_part_are_read(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("real", "at"), [("qs", 3), ("q_w", 3), ("rw", 0)])
 def test_a_quaternions_real_part_is_found_under_any_name(tmp_path, real, at):
     """It makes quaternions of either sign unit ones, whatever its column is called."""
-    both, mount = pairs()
+    sides, mount = pairs()
     names, columns = [], []
-    for side, poses in zip(("robot", "cam"), both, strict=True):
+    for side, poses in zip(("robot", "cam"), sides, strict=True):
         last = ["qx", "qy", "qz"]
         last.insert(at, real)
         names += [f"{side}_{name}" for name in ("x", "y", "z", *last)]
@@ -1759,13 +1761,13 @@ def test_a_quaternions_real_part_is_found_under_any_name(tmp_path, real, at):
         columns += [poses[:, :3, 3], np.roll(turns, at - 3, axis=1)]
     write_table(tmp_path / "in.csv", names, np.hstack(columns))
     visioncal("convert", tmp_path / "in.csv", tmp_path / "out", "--mount", mount).good()
-    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
+    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), sides, atol=1e-9)
 
 
 @pytest.mark.parametrize("tracker", ["vicon", "mocap"])
 def test_motion_capture_is_the_robots_where_no_other_is(tmp_path, tracker):
-    both, mount = pairs()
-    robot, board = np.array([[seven(pose) for pose in poses] for poses in both])
+    sides, mount = pairs()
+    robot, board = np.array([[seven(pose) for pose in poses] for poses in sides])
     last = ("x", "y", "z", "qx", "qy", "qz", "qw")
     names = [f"{tracker}_{name}" for name in last]
     shoot(tmp_path / "shot", "{}.png")
@@ -1773,7 +1775,7 @@ def test_motion_capture_is_the_robots_where_no_other_is(tmp_path, tracker):
     said = ("--mount", mount, "--target", "charuco_9x6_30mm")
     visioncal("convert", tmp_path / "shot", tmp_path / "a", *said).good()
     found = [view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "a").views]
-    np.testing.assert_allclose(found, both[0], atol=1e-9)
+    np.testing.assert_allclose(found, sides[0], atol=1e-9)
     for other in ("board", "camera"):
         table = tmp_path / f"{other}.csv"
         of_robot = [name.replace("_", "_hand_") if other == "camera" else name for name in names]
@@ -1781,7 +1783,7 @@ def test_motion_capture_is_the_robots_where_no_other_is(tmp_path, tracker):
         write_table(table, columns, np.hstack([robot, board]))
         visioncal("convert", table, tmp_path / f"of_{other}", "--mount", mount).good()
         found = came_in(Session.load(tmp_path / f"of_{other}"))
-        np.testing.assert_allclose(found, both, atol=1e-9)
+        np.testing.assert_allclose(found, sides, atol=1e-9)
 
 
 def test_a_contradicted_mount_is_reported_before_a_form_is_asked_for(tmp_path, monkeypatch):

@@ -309,7 +309,7 @@ def test_a_file_of_poses_names_the_line_that_is_wrong(tmp_path):
     raised(DataError, r"line 2.*must be a pose", read_fields, path)
 
 
-def asked(lines):
+def asker(lines):
     """What asks, and the questions that it asked."""
     questions, left = [], iter(lines)
 
@@ -324,7 +324,7 @@ def asked(lines):
 
 
 def test_a_pose_is_shown_back_and_taken_when_the_person_agrees():
-    ask, questions = asked(["{X 400, Y -100, Z 300, A 10, B -20, C 170}", ""])
+    ask, questions = asker(["{X 400, Y -100, Z 300, A 10, B -20, C 170}", ""])
     arm: Arm = ManualArm(ask)
     state = arm.state()
     wanted = a_pose(Rotation.from_euler("ZYX", [10, -20, 170], degrees=True))
@@ -335,7 +335,7 @@ def test_a_pose_is_shown_back_and_taken_when_the_person_agrees():
 
 
 def test_a_person_is_asked_for_each_view_until_it_is_enough():
-    ask, questions = asked(["", "p[0.4,0,0,0,0,0]", "", " Q"])
+    ask, questions = asker(["", "p[0.4,0,0,0,0,0]", "", " Q"])
     arm: RequestingArm = ManualArm(ask)
     assert isinstance(arm, RequestingArm)
     assert arm.request(0.0, "View 3 (tilt the camera)").base_from_flange[0, 3] == 0.4
@@ -347,7 +347,7 @@ def test_a_person_is_asked_for_each_view_until_it_is_enough():
 
 def test_lines_of_a_file_are_a_pose_each_and_none_is_passed_over():
     lines = ["", "p[0.4,0,0,0,0,0]", "p[0.5,0,0,0,0,0]", "p[0.6,0", "p[0.7,0,0,0,0,0]", "q"]
-    ask, questions = asked(lines)
+    ask, questions = asker(lines)
     arm = ManualArm(ask, answers=False)
     assert [arm.state().base_from_flange[0, 3] for _ in range(2)] == [0.4, 0.5]
     raised(DriverError, "must be a pose", arm.state)
@@ -355,5 +355,5 @@ def test_lines_of_a_file_are_a_pose_each_and_none_is_passed_over():
     with pytest.raises(EOFError):
         arm.state()
     assert set(questions) == {""}
-    ask, _ = asked(["400 -100 300 10 -20 170"])
+    ask, _ = asker(["400 -100 300 10 -20 170"])
     raised(DriverError, "--pose-form", ManualArm(ask, answers=False).state)

@@ -221,8 +221,10 @@ def test_missing_columns_are_named_with_the_next_step(tmp_path):
     row = reads(["M{stop}"])
     points = joined([["Name", "Actual X", "Actual Y", "Actual Z"], *(row(*r) for r in shop().rows)])
     (tmp_path / "points.csv").write_text(points)
-    alone = visioncal("convert", tmp_path / "points.csv", tmp_path / "out")
-    alone.refused("10 measured points, but neither joint angles nor poses", "Add columns J1 [deg]")
+    refused = visioncal("convert", tmp_path / "points.csv", tmp_path / "out")
+    refused.refused(
+        "10 measured points, but neither joint angles nor poses", "Add columns J1 [deg]"
+    )
     (tmp_path / "in").mkdir()
     (tmp_path / "in/points.csv").write_text(points.replace("M", "Messung "))
     (tmp_path / "in/arm.csv").write_text(joined(joints_table("x").splitlines()[:8]))

@@ -145,14 +145,14 @@ def test_the_command_lists_a_diff_and_never_writes_over_the_program(tmp_path):
     calibrate(session_of(shop)).save(tmp_path / "out" / "calibration.json")
     source = tmp_path / "hand.script"
     source.write_bytes((PROGRAMS / "hand.script").read_bytes().replace(b"\n", b"\r\n"))
-    asked = ("correct", source, "--against", tmp_path / "out")
-    command(*asked).refused("-o FOLDER is missing")
-    told = command(*asked, "-o", tmp_path / "sent").good()
-    assert "3 targets corrected" in told.said
-    assert "left as it is: hand.script, line 7: pose_add(here" in told.err
-    assert len(re.findall(r"^\+ ", told.out, re.MULTILINE)) == 3
+    words = ("correct", source, "--against", tmp_path / "out")
+    command(*words).refused("-o FOLDER is missing")
+    done = command(*words, "-o", tmp_path / "sent").good()
+    assert "3 targets corrected" in done.said
+    assert "left as it is: hand.script, line 7: pose_add(here" in done.err
+    assert len(re.findall(r"^\+ ", done.out, re.MULTILINE)) == 3
     written = (tmp_path / "sent" / "hand.script").read_bytes()
     assert written.count(b"\r\n") == source.read_bytes().count(b"\n")
-    command(*asked, "-o", tmp_path / "sent").refused("hand.script")
-    command(*asked, "-o", tmp_path).refused("hand.script")
+    command(*words, "-o", tmp_path / "sent").refused("hand.script")
+    command(*words, "-o", tmp_path).refused("hand.script")
     assert isinstance(arm_of("URScript").real, Robot)

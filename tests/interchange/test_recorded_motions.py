@@ -74,8 +74,8 @@ def test_a_bag_is_the_session_that_it_was_made_of(form, options, source, rendere
     path = bag(tmp_path / ("b.bag" if form == "ros1" else "b"), source, rendered, form=form,
                is_compressed=options.pop("is_compressed", False), **options)  # fmt: skip
     said = []
-    asked = replace(BOARD, progress=lambda *each: said.append(each))
-    session = convert(path, tmp_path / "out", requested=asked)
+    requested = replace(BOARD, progress=lambda *each: said.append(each))
+    session = convert(path, tmp_path / "out", requested=requested)
     assert session.mount == "eye-in-hand"
     assert said[-1][1] == said[-1][2]
     assert [*session.declaration.camera.matrix] == LENS["matrix"]
@@ -222,8 +222,8 @@ def test_poses_frames_and_lenses_may_be_named(source, rendered, tmp_path):
     stated = {"camera_matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]}
     lens = tmp_path / "lens.json"
     lens.write_text(json.dumps(stated | {"distortion_coefficients": LENS["distortion"]}))
-    asked = replace(BOARD, mount="eye-in-hand", intrinsics=str(lens))
-    session = convert(path, tmp_path / "out", requested=asked)
+    requested = replace(BOARD, mount="eye-in-hand", intrinsics=str(lens))
+    session = convert(path, tmp_path / "out", requested=requested)
     assert len(session.views) == len(source.views)
     assert session.declaration.camera.resolution == source.declaration.camera.resolution
     assert [*session.declaration.camera.matrix] == LENS["matrix"]

@@ -41,7 +41,7 @@ def fleet(tmp_path_factory):
 
 
 @pytest.fixture
-def here(monkeypatch):
+def in_this_process(monkeypatch):
     """Works in this process: what its workers are does not matter."""
     monkeypatch.setattr(batch_run, "rows_of", lambda jobs, *_: map(work, jobs))
 
@@ -54,10 +54,10 @@ def expect_results_of_calibrate(fleet, out, rows):
     done = {row.name: row for row in rows if row.state == "done"}
     assert sorted(done) == [f"robot_{name}/week_{at}" for name in (0, 1) for at in (0, 1)]
     for name, row in done.items():
-        alone = run(fleet / name).calibration
-        verdict = alone.verdict.with_paths(fleet / name, out.absolute() / name)
+        expected = run(fleet / name).calibration
+        verdict = expected.verdict.with_paths(fleet / name, out.absolute() / name)
         found = Calibration.load(out / name)
-        assert facts(found) == facts(replace(alone, verdict=verdict))
+        assert facts(found) == facts(replace(expected, verdict=verdict))
         assert (row.entry.figures["residual_mm"], row.entry.figures["used"]) == (found.rms.mm, 10)
     failed = {row.name: row for row in rows if row.state == "failed"}
     assert sorted(failed) == ["broken", "empty"]
@@ -68,11 +68,11 @@ def expect_results_of_calibrate(fleet, out, rows):
 
 @pytest.mark.slow
 def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
-    told = []
+    steps = []
     found = batch(
-        fleet / "*", tmp_path, workers=2, without=BARE, progress=lambda *step: told.append(step)
+        fleet / "*", tmp_path, workers=2, without=BARE, progress=lambda *step: steps.append(step)
     )
-    assert told == [("batch", done, 6) for done in range(7)]
+    assert steps == [("batch", done, 6) for done in range(7)]
     expect_results_of_calibrate(fleet, tmp_path, found.rows)
     table = parquet.read_table(found.table).to_pylist()
     assert [value["name"] for value in table] == [row.name for row in found.rows]
@@ -85,7 +85,7 @@ def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_this_process")
 def test_finished_sessions_are_kept_by_another_batch(fleet, tmp_path):
     found = batch(fleet / "robot_*/week_1", tmp_path, without=BARE)
 
@@ -106,8 +106,10 @@ def test_finished_sessions_are_kept_by_another_batch(fleet, tmp_path):
     (row,) = batch(fleet / "robot_0/week_1", tmp_path / "robot_0", without=BARE).rows
     table.write_text(whole)
     assert (row.state, row.entry.figures["views"]) == ("done", 9)
-    (asked,) = batch(fleet / "robot_1/week_1", tmp_path / "robot_1", without=BARE, need_mm=1.0).rows
-    assert asked.state == "done"
+    (row_with_need,) = batch(
+        fleet / "robot_1/week_1", tmp_path / "robot_1", without=BARE, need_mm=1.0
+    ).rows
+    assert row_with_need.state == "done"
 
 
 def fatal(job):
@@ -153,7 +155,7 @@ def test_sessions_are_found_and_named(fleet, tmp_path):
         jobs_of([str(tmp_path / "both*")], tmp_path, Options())
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_this_process")
 def test_the_command_says_what_became_of_the_sessions(fleet, tmp_path):
     new = tmp_path / "new"
     done = visioncal("batch", fleet / "robot_0", "-o", new, "--workers", 1).good()
@@ -164,8 +166,8 @@ def test_the_command_says_what_became_of_the_sessions(fleet, tmp_path):
 
     # The same session agrees with its result to rounding; the cell of another seed is elsewhere.
     words = ("batch", fleet / "robot_0", "-o", new, "--against", new / "week_0")
-    told = visioncal(*words).good().out
-    first, second = (re.search(rf"{name} +good +(.*)", told)[1] for name in ("week_0", "week_1"))
+    printed = visioncal(*words).good().out
+    first, second = (re.search(rf"{name} +good +(.*)", printed)[1] for name in ("week_0", "week_1"))
     assert first.strip() == "nothing beyond noise"
     assert second.startswith("flange_from_cam by ")
     rows = [*csv.DictReader((new / "against.csv").read_text().splitlines())]

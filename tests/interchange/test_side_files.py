@@ -66,8 +66,8 @@ LENS = {
 }
 
 
-@pytest.mark.parametrize("beside", [frames_of_cameras, frames_in_a_list])
-def test_joint_angles_of_all_pictures_come_before_frames_of_a_few(tmp_path, beside):
+@pytest.mark.parametrize("write_frames", [frames_of_cameras, frames_in_a_list])
+def test_joint_angles_of_all_pictures_come_before_frames_of_a_few(tmp_path, write_frames):
     shoot(tmp_path / "in/images", "img{}_cam1.png", 12)
     joints = np.random.default_rng(1).uniform(-90, 90, (12, 6))
     rows = [
@@ -79,7 +79,7 @@ def test_joint_angles_of_all_pictures_come_before_frames_of_a_few(tmp_path, besi
         for at, row in enumerate(joints.tolist())
     ]
     write(tmp_path / "in/side/dataset.json", {"robot": "UR3", "poses": rows})
-    beside(tmp_path / "in")
+    write_frames(tmp_path / "in")
     lengths_of_links(tmp_path / "in")
     write(tmp_path / "in/lens/cam1.json", LENS)
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", *BOARD).good()
@@ -293,9 +293,9 @@ def test_positions_and_rotations_in_a_file_each_are_poses(tmp_path):
 def test_joint_angles_in_chinese_are_no_camera_s(tmp_path, names):
     poses = matrices(6)
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz", degrees=True)
-    both = np.hstack([1e3 * poses[:, :3, 3], turns]).tolist()
+    flanges = np.hstack([1e3 * poses[:, :3, 3], turns]).tolist()
     joints = np.random.default_rng(1).uniform(-150, 150, (6, 6)).tolist()
-    rows = [dict(zip(names, row, strict=True)) for row in zip(both, joints, strict=True)]
+    rows = [dict(zip(names, row, strict=True)) for row in zip(flanges, joints, strict=True)]
     write(tmp_path / "in/record.json", rows)
     said = ("--mount", "eye-in-hand", "--robot-form", "euler-xyz-deg")
     said = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).refused().err

@@ -124,8 +124,8 @@ def copied(folder):
     poses, seen, _ = world()
     pairs = [*zip(poses.tolist(), seen.tolist(), strict=True)]
     write(folder / "seen.json", [{"tag_pose": board} for _, board in pairs])
-    both = [{"T_measured": board, "T_nominal": pose} for pose, board in pairs]
-    write(folder / "transforms.json", both)
+    records = [{"T_measured": board, "T_nominal": pose} for pose, board in pairs]
+    write(folder / "transforms.json", records)
 
 
 def called_by_an_equation(folder):

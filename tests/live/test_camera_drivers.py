@@ -440,7 +440,7 @@ def opened(capture, source=0, requested=None):
     return UvcCamera(source, requested)
 
 
-def asked(camera, capture, *times_s, pause_s=0.0, last_s=0.0):
+def picture_of_request(camera, capture, *times_s, pause_s=0.0, last_s=0.0):
     """The number of the picture that a request gets, of those that come after it."""
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(camera.frame, timeout_s=PATIENT_S)
@@ -458,7 +458,7 @@ def asked(camera, capture, *times_s, pause_s=0.0, last_s=0.0):
 
 def test_a_frame_that_was_under_way_at_the_request_is_skipped(capture):
     camera = opened(capture)
-    number, frame = asked(camera, capture, 0.0, 0.0, pause_s=0.05)
+    number, frame = picture_of_request(camera, capture, 0.0, 0.0, pause_s=0.05)
     assert number == 3
     assert abs(frame.stamp_s - time.monotonic()) < PATIENT_S
     # Only what is given is decoded.
@@ -471,7 +471,7 @@ def test_a_burst_after_a_stall_had_waited_and_is_passed_by(capture):
         time.sleep(0.1)
         capture.coming.put(0.0)
     # Ten at once, then one after an interval.
-    assert asked(camera, capture, *[0.0] * 10, last_s=0.3)[0] == 17
+    assert picture_of_request(camera, capture, *[0.0] * 10, last_s=0.3)[0] == 17
 
 
 def test_a_kernels_time_is_taken_where_it_can_be_true(capture):
@@ -480,7 +480,7 @@ def test_a_kernels_time_is_taken_where_it_can_be_true(capture):
     time.sleep(0.3)
     # Exposed before the request; then after it.
     fresh_s = time.monotonic() + 0.1
-    number, frame = asked(camera, capture, soon_s, fresh_s, pause_s=0.2)
+    number, frame = picture_of_request(camera, capture, soon_s, fresh_s, pause_s=0.2)
     assert number == 3
     # Rounding of a time in ms is far less; a share of the time since the start would be far more.
     assert frame.stamp_s == pytest.approx(fresh_s - 0.01, abs=1e-4)

@@ -427,10 +427,10 @@ def test_a_plan_is_read_back_as_it_was_made(planned):
     folder, plan = planned
     for path in (folder, folder / "plan.json"):
         read = read_plan(path)
-        for mine, its in zip(read.stops, plan.stops, strict=True):
-            assert (mine.view, mine.words) == (its.view, its.words)
-            assert np.array_equal(mine.q, its.q)
-            assert np.array_equal(mine.via, its.via)
+        for stop, its in zip(read.stops, plan.stops, strict=True):
+            assert (stop.view, stop.words) == (its.view, its.words)
+            assert np.array_equal(stop.q, its.q)
+            assert np.array_equal(stop.via, its.via)
         assert np.array_equal(read.start_q, plan.request.start_q)
         assert (read.cell.limits, read.cell.target) == (plan.cell.limits, plan.cell.target)
         assert read.cell.robot.name == "ur5e"

@@ -39,9 +39,9 @@ class CameraNode(dai.node.ThreadedHostNode):
         self.seen.socket = socket.name
         return self
 
-    def requestOutput(self, *asked):  # noqa: N802
+    def requestOutput(self, *options):  # noqa: N802
         """Tells what was asked for."""
-        self.seen.level = asked
+        self.seen.level = options
         return self.out
 
     def run(self):
@@ -124,8 +124,8 @@ def a_device(monkeypatch, *, lens=0, coefficients=(), is_colour=True, has_autofo
 
         def create(self, node):
             """Makes a node; the device's own tell what they are asked."""
-            own = node in (CameraNode, DepthNode)
-            return self.real.create(node, seen) if own else self.real.create(node)
+            is_faked = node in (CameraNode, DepthNode)
+            return self.real.create(node, seen) if is_faked else self.real.create(node)
 
         def __getattr__(self, name):
             return getattr(self.real, name)
@@ -151,10 +151,10 @@ def test_a_device_is_held_where_automatic_exposure_and_focus_went(monkeypatch):
     (control,) = seen.sent
     assert control.getExposureTime().total_seconds() == pytest.approx(6e-3)
     assert (control.getSensitivity(), control.getLensPosition()) == (320, 131)
-    asked = time.monotonic()
+    request_s = time.monotonic()
     frame = camera.frame(timeout_s=PATIENT_S)
     assert frame.image.shape == (1520, 2028, 3)
-    assert frame.stamp_s - 0.003 >= asked
+    assert frame.stamp_s - 0.003 >= request_s
     # Never undistorted by the device: the lens is ours to calibrate.
     assert seen.level[-1] is False
     camera.close()
@@ -198,9 +198,11 @@ def test_depth_is_that_of_each_pixel_of_a_distorted_picture(monkeypatch):
     device.depths, matrix = ["stereo"], np.array([[250, 0, 159.5], [0, 250, 99.5], [0, 0, 1.0]])
     handler = device.readCalibrationOrDefault()
     handler.setCameraIntrinsics(device.sensor.socket, matrix.tolist(), 320, 200)
-    here = dai.Extrinsics(np.eye(4).tolist(), device.sensor.socket)
+    extrinsics = dai.Extrinsics(np.eye(4).tolist(), device.sensor.socket)
     distortion = [*coefficients, *[0.0] * 9]
-    seen.transformation = dai.ImgTransformation(320, 200, PINHOLE, PERSPECTIVE, distortion, here)
+    seen.transformation = dai.ImgTransformation(
+        320, 200, PINHOLE, PERSPECTIVE, distortion, extrinsics
+    )
     camera = OakCamera("", DeviceSetup((320, 200)))
     frame = camera.frame(timeout_s=PATIENT_S)
     camera.close()

@@ -56,13 +56,13 @@ def typed(page, folder: Path, view, line: str, place: int) -> None:
 def cell(tmp_path_factory) -> Path:
     """A cell's images, and those of two later days: on the second the camera has moved."""
     folder = tmp_path_factory.mktemp("page")
-    own = ["--robot", "generic-6r-1800", "--seed", "4"]
+    options = ["--robot", "generic-6r-1800", "--seed", "4"]
     for words in (
         ["seen", "--views", "10", "--with-intrinsics"],
         ["monday", "--views", "5", "--recording", "1"],
         ["tuesday", "--views", "5", "--recording", "2", "--camera-moved-mm", "1.5"],
     ):
-        command("simulate", folder / words[0], *words[1:], *own)
+        command("simulate", folder / words[0], *words[1:], *options)
         (folder / words[0] / "shown").write_text("0")
     return folder
 

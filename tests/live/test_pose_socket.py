@@ -227,7 +227,7 @@ def arm():
     opened.close()
 
 
-def asked(arm, words):
+def answer_to(arm, words):
     """The answer to one line of a new client."""
     with client_of(arm) as link:
         link.sendall(words)
@@ -260,17 +260,17 @@ POSE, JOINTS = b"p[0.4, 0, 0.3, 0, 3.1, 0]", b"0 -90 90 0 45 10,5"
     ],
 )
 def test_a_line_is_understood_or_its_programmer_learns_why(arm, line, answer):
-    got, state = asked(arm, line)
+    got, state = answer_to(arm, line)
     assert got.startswith(answer), got
     assert got.endswith("\n")
     assert (state is not None) == (answer == "next\n")
 
 
 def test_joints_are_sent_at_all_stops_or_at_none(arm):
-    _, state = asked(arm, line_of(1, " | 0 -90 90 0 45 10.5 deg\n"))
+    _, state = answer_to(arm, line_of(1, " | 0 -90 90 0 45 10.5 deg\n"))
     assert np.allclose(np.rad2deg(state.q), [0, -90, 90, 0, 45, 10.5])
     assert state.stop == 1
-    assert asked(arm, line_of(2))[0].startswith("error 0 joints, and 6")
+    assert answer_to(arm, line_of(2))[0].startswith("error 0 joints, and 6")
 
 
 def test_the_last_view_is_answered_done_even_where_that_answer_is_lost(arm):
@@ -306,7 +306,7 @@ def test_a_program_ends_the_recording_and_learns_that_it_ended(arm):
 
 def test_a_robot_that_does_not_come_back_ends_the_recording():
     arm = SocketArm("127.0.0.1", 0, patience_s=0.05)
-    asked(arm, b"hello\n")
+    answer_to(arm, b"hello\n")
     raised(DriverError, "no stop .* was last refused: 'hello' must be a stop", arm.request, 5.0)
     raised(DriverError, "cannot be opened for", SocketArm, "127.0.0.1", arm.port)
     arm.close()
@@ -348,7 +348,7 @@ def test_a_flood_of_silent_clients_leaves_the_robot_its_place(arm):
             stack.enter_context(client_of(arm))
             arm.request(0.0)
         assert len(arm._waiting) <= pose_socket._MOST_WAITING
-        got, state = asked(arm, line_of(1))
+        got, state = answer_to(arm, line_of(1))
         assert (got, state.stop) == ("next\n", 1)
 
 

@@ -102,9 +102,9 @@ def a_cell(**options):
 def errors_px(image, exact):
     found = KINDS["charuco"].search(image, TARGET)
     assert isinstance(found, DetectedCorners)
-    ids, mine, theirs = np.intersect1d(found.ids, exact.ids, return_indices=True)
+    ids, rows, exact_rows = np.intersect1d(found.ids, exact.ids, return_indices=True)
     assert len(ids) > 0.8 * len(exact.ids)
-    return found.px[mine] - exact.px[theirs]
+    return found.px[rows] - exact.px[exact_rows]
 
 
 def test_at_rest_corners_are_as_good_as_in_a_written_session():
@@ -122,8 +122,8 @@ def test_at_rest_corners_are_as_good_as_in_a_written_session():
 def a_camera(true_joints=None, **options):
     """A camera, with a clock that passes only where somebody waits."""
     cell, time = a_cell(**options), FakeClock(100.003)
-    told = true_joints or (lambda moments: np.tile(cell.robot.joints[0], (len(moments), 1)))
-    camera = SimulatedCamera(cell, told, rate_hz=10.0, exposure_s=0.02, clock=time)
+    joints_of = true_joints or (lambda moments: np.tile(cell.robot.joints[0], (len(moments), 1)))
+    camera = SimulatedCamera(cell, joints_of, rate_hz=10.0, exposure_s=0.02, clock=time)
     return cell, time, camera
 
 
@@ -132,24 +132,24 @@ def test_pictures_come_at_even_times_and_begin_after_the_call():
     assert isinstance(camera, CameraDevice)
     stamps = []
     for _ in range(3):
-        asked = time.seconds
+        request_s = time.seconds
         frame = camera.frame()
-        assert frame.stamp_s - 0.5 * frame.exposure_s >= asked - 1e-9
+        assert frame.stamp_s - 0.5 * frame.exposure_s >= request_s - 1e-9
         stamps.append(frame.stamp_s)
     assert np.diff(stamps) == pytest.approx([0.1, 0.1])
 
 
 def test_the_arm_is_asked_for_the_time_of_exposure():
-    asked = []
+    moments_s = []
 
-    def told(moments):
-        asked.extend(moments)
+    def joints_of(moments):
+        moments_s.extend(moments)
         return np.tile(cell.robot.joints[0], (len(moments), 1))
 
-    cell, _, camera = a_camera(told)
+    cell, _, camera = a_camera(joints_of)
     frame = camera.frame()
-    assert min(asked) == pytest.approx(frame.stamp_s - 0.01)
-    assert max(asked) == pytest.approx(frame.stamp_s + 0.01)
+    assert min(moments_s) == pytest.approx(frame.stamp_s - 0.01)
+    assert max(moments_s) == pytest.approx(frame.stamp_s + 0.01)
 
 
 @pytest.mark.slow

@@ -69,8 +69,8 @@ def test_a_plan_has_a_table_a_program_a_preview_and_all_of_it_as_json(planned, d
     # Six stops with the board filling the image know the camera's place to well under 1 mm.
     assert 0.0 < document["predicted"]["after"]["sigma_mm"] < 1.0
     by_rank = sorted(document["stops"], key=lambda pair: pair["rank"])
-    told = [value["after"]["sigma_mm"] for value in by_rank if "sigma_mm" in value["after"]]
-    assert told == sorted(told, reverse=True)
+    sigmas = [value["after"]["sigma_mm"] for value in by_rank if "sigma_mm" in value["after"]]
+    assert sigmas == sorted(sigmas, reverse=True)
 
 
 def test_the_table_opens_as_views_with_the_models_poses(planned, document):

@@ -93,9 +93,9 @@ def test_the_probe_is_seen_and_everything_is_clear():
 def test_stops_are_added_to_a_session_and_what_was_recorded_counts(tmp_path):
     command("simulate", tmp_path / "A", "--instrument", "point", "--robot", ARM, "--views", 12)
     out = tmp_path / "plan"
-    asked = ("--candidates", 300, "-o", out)
-    told = command("plan", tmp_path / "A", "--add", 8, *asked).good().out
-    figures = re.search(r"sigma: ([0-9.]+) mm before, ([0-9.]+) mm after", told)
+    options = ("--candidates", 300, "-o", out)
+    printed = command("plan", tmp_path / "A", "--add", 8, *options).good().out
+    figures = re.search(r"sigma: ([0-9.]+) mm before, ([0-9.]+) mm after", printed)
     before, after = map(float, figures.groups())
     # 12 stops determine 27 values with 36 numbers; 20 have twice the redundancy.
     assert after < 0.8 * before

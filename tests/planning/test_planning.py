@@ -91,12 +91,12 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     scale = (0.05 / max(seen.pixel_px, 1e-6)) ** 2
     in_view = replace(problem.observations, covariance=scale * problem.observations.covariance)
     state = State(np.stack([cell.x, cell.z]), problem.start_values)
-    there = fisher_information(replace(problem, observations=in_view), state, cell.noise)
+    fisher = fisher_information(replace(problem, observations=in_view), state, cell.noise)
     summed = np.einsum("kij,kil->jl", factors, factors)
-    size = 1.0 / np.sqrt(np.diag(there)[:12])
+    size = 1.0 / np.sqrt(np.diag(fisher)[:12])
     # Poses and corners agree to rounding of the fit of each pose (1e-6 rad and m).
     assert summed[:12, :12] * np.outer(size, size) == pytest.approx(
-        there[:12, :12] * np.outer(size, size), abs=1e-4
+        fisher[:12, :12] * np.outer(size, size), abs=1e-4
     )
 
 
@@ -211,8 +211,8 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     begun, q = start_from_session(*found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q)
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
-    beside = ("size of arm errors", "noise_level")
-    not_known = sum((known.assessment.fit.by_source.get(name, 0.0) for name in beside), 0.0)
+    sources = ("size of arm errors", "noise_level")
+    not_known = sum((known.assessment.fit.by_source.get(name, 0.0) for name in sources), 0.0)
     covariance = known.assessment.fit.whole - not_known
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     world = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]

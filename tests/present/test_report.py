@@ -212,9 +212,9 @@ def test_a_certificate_says_whose_it_is_and_prints_on_one_page_with_room_to_sign
 def test_the_command_writes_a_certificate_of_a_recording(outputs, tmp_path):
     page = tmp_path / "certificate.html"
     visioncal("show", outputs, "--certificate", "--serial", "robot=7", "-o", page).good()
-    beside = outputs / "certificate.html"
-    assert f"wrote {beside}" in visioncal("show", outputs, "--certificate").err
-    beside.unlink()
+    certificate = outputs / "certificate.html"
+    assert f"wrote {certificate}" in visioncal("show", outputs, "--certificate").err
+    certificate.unlink()
     assert "serial number, robot 7" in Page(page.read_text("utf-8")).words
     assert visioncal("show", outputs, "--operator", "me").status == 2
     assert visioncal("show", outputs, "--certificate", "--serial", "7").status == 2

@@ -104,15 +104,15 @@ def stub(tmp_path):
 
 
 def test_the_native_viewer_ends_with_all_that_it_started(out, stub, tmp_path):
-    told = tmp_path / "told.json"
+    record = tmp_path / "told.json"
     process = subprocess.Popen(
         command(out), stderr=subprocess.PIPE, text=True, env=ENVIRONMENT | stub(STUB)
     )
     try:
         end = time.monotonic() + 60
-        while not told.exists() and time.monotonic() < end:
+        while not record.exists() and time.monotonic() < end:
             time.sleep(0.05)
-        viewer = json.loads(told.read_text())
+        viewer = json.loads(record.read_text())
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=60) == 0
         assert process.stderr.read() == ""

@@ -31,8 +31,8 @@ def cell(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cell")
     views = ("--no-images", "--views")
     command("simulate", folder / "cell", *views, 12).good()
-    asked = ("-o", folder / "out", "--history", folder / "site.db")
-    command("calibrate", folder / "cell", *asked).good()
+    options = ("-o", folder / "out", "--history", folder / "site.db")
+    command("calibrate", folder / "cell", *options).good()
     knocked = ("--recording", 1, "--camera-moved-mm", 3)
     command("simulate", folder / "later", *views, 6, *knocked).good()
     return folder
@@ -40,8 +40,8 @@ def cell(tmp_path_factory):
 
 def test_a_failed_check_records_residuals_and_the_cause(cell):
     out = cell / "check"
-    asked = ("--against", cell / "out", "-o", out, "--history", cell / "site.db")
-    assert command("verify", cell / "later", *asked).status == 3
+    options = ("--against", cell / "out", "-o", out, "--history", cell / "site.db")
+    assert command("verify", cell / "later", *options).status == 3
     document = json.loads((out / "verify.json").read_text())
     assert not document["passed"]
     found = logged(out / "recording.rrd")

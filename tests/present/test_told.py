@@ -156,7 +156,7 @@ def words_of(html):
     return [unescape(" ".join(line.split())) for line in lines if line.strip()]
 
 
-def told():
+def lines_of_pages():
     """Lines of all pages and notes."""
     lines: dict[str, list[str]] = {}
     for name, calibration, sample in shown():
@@ -172,7 +172,7 @@ def told():
 
 @pytest.fixture(scope="module")
 def now():
-    return told()
+    return lines_of_pages()
 
 
 @pytest.mark.parametrize("name", json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else [])
@@ -188,4 +188,4 @@ def test_pages_and_notes_keep_their_words(name, now):
 
 
 if __name__ == "__main__":
-    KEPT.write_text(json.dumps(told(), indent=0, ensure_ascii=False) + "\n", "utf-8")
+    KEPT.write_text(json.dumps(lines_of_pages(), indent=0, ensure_ascii=False) + "\n", "utf-8")

@@ -59,10 +59,10 @@ def test_picks_by_the_controllers_poses(result):
 
 def test_the_verdict_is_about_the_controllers_poses(run, result):
     need = Need(2.0 * result.verdict.good_for_mm)
-    own = judge(replace(run.findings, need=need))
-    assert own.status == "bad"
-    assert own.causes[0].kind == "uncorrected_targets"
-    assert "visioncal correct" in own.next_steps[0].command
+    uncorrected = judge(replace(run.findings, need=need))
+    assert uncorrected.status == "bad"
+    assert uncorrected.causes[0].kind == "uncorrected_targets"
+    assert "visioncal correct" in uncorrected.next_steps[0].command
     assert judge(replace(run.findings, need=need, corrects_targets=True)).status == "good"
     met = Need(1.05 * result.verdict.good_for_mm_uncorrected)
     assert judge(replace(run.findings, need=met)).status == "good"
@@ -72,8 +72,8 @@ def test_the_verdict_is_about_the_controllers_poses(run, result):
 def test_the_condition_goes_with_every_output(result, tmp_path):
     (condition,) = result.conditions
     assert condition.kind == "calibrated-arm"
-    own = figure(rounded_up(result.verdict.good_for_mm_uncorrected))
-    assert f"within {own} mm" in condition.sentence
+    limit = figure(rounded_up(result.verdict.good_for_mm_uncorrected))
+    assert f"within {limit} mm" in condition.sentence
     write_certificate(tmp_path / "page.html", result, None, {})
     said = [(tmp_path / "page.html").read_text(), result._repr_html_(), verdict_markdown(result)]
     assert all("belong to the calibrated arm" in text for text in said)

@@ -99,10 +99,10 @@ def test_the_true_arm_brings_the_camera_to_where_it_is_wanted(cell, result, by_p
     after = rms_mm(wanted, seen(sent.q))
     # Without joint angles: the edges alone, and the nominal controller.
     nominal_x, nominal_z = (edge.matrix for edge in by_poses.edges.values())
-    told = nominal_z @ invert(wanted) @ invert(nominal_x)
+    nominal_flanges = nominal_z @ invert(wanted) @ invert(nominal_x)
     nominal = Inverse(result.robot)
     before = rms_mm(
-        wanted, seen(np.array([nominal.solve(value, HOME).positions for value in told]))
+        wanted, seen(np.array([nominal.solve(value, HOME).positions for value in nominal_flanges]))
     )
     assert before > 2.0
     # Forty views leave 4 to 10 % of the nominal arm's error.
@@ -271,9 +271,9 @@ def test_a_table_is_corrected_and_keeps_its_other_columns(stored, result):
         assert numbers(row, JOINTS) == pytest.approx(q, abs=2e-6)
         assert float(row["moved_mm"]) == pytest.approx(mm, abs=1e-3)
         assert float(row["sigma_mm"]) > 0.0
-        told = result.robot.base_from_flange(numbers(row, JOINTS)[None])[0, :3, 3]
+        expected = result.robot.base_from_flange(numbers(row, JOINTS)[None])[0, :3, 3]
         # Joints are written to 0.1 nrad, positions to 0.1 nm.
-        assert numbers(row, ("x_m", "y_m", "z_m")) == pytest.approx(told, abs=2e-9)
+        assert numbers(row, ("x_m", "y_m", "z_m")) == pytest.approx(expected, abs=2e-9)
     run("correct", stored / "o.csv", "-c", stored).refused("would be so twice")
 
 
@@ -304,8 +304,8 @@ def test_targets_of_a_tool_are_answered_for_the_tool(stored, result):
         # The tables' 0.1 um, and 1e-9 of a quaternion at 0.1 m.
         assert numbers(row, JOINTS) == pytest.approx(numbers(flange, JOINTS), abs=2e-6)
         q = numbers(row, JOINTS)[None]
-        told = (result.robot.base_from_flange(q) @ flange_from_cam)[0, :3, 3]
-        assert numbers(row, ("x_m", "y_m", "z_m")) == pytest.approx(told, abs=2e-9)
+        expected = (result.robot.base_from_flange(q) @ flange_from_cam)[0, :3, 3]
+        assert numbers(row, ("x_m", "y_m", "z_m")) == pytest.approx(expected, abs=2e-9)
     run("correct", table, "-c", stored, "--tool", "camm").refused("Did you mean cam?")
 
 
@@ -350,8 +350,8 @@ def test_ways_through_singular_postures_are_found(stored, result):
     ).good()
     # To the digits of the table.
     for row, pose in zip(rows_of(done.out), result.robot.base_from_flange(joints), strict=True):
-        (there,) = result.base_from_flange(numbers(row, JOINTS)[None]).as_matrix()
-        assert there == pytest.approx(pose, abs=1e-6)
+        (reached,) = result.base_from_flange(numbers(row, JOINTS)[None]).as_matrix()
+        assert reached == pytest.approx(pose, abs=1e-6)
 
 
 @pytest.mark.parametrize(

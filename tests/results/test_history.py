@@ -94,8 +94,8 @@ def test_entries_are_only_appended(tmp_path):
     assert history.append(entry(1), entry(2, kind="verified", cell="cell 2", edges={})) == 2
     assert history.append(entry(1), entry(3)) == 1
     # The same words at the same time, of two other inputs.
-    both = [entry(4, edges={}, sha256=digest) for digest in "ab"]
-    assert History(tmp_path / "both.db").append(*both) == 2
+    entries = [entry(4, edges={}, sha256=digest) for digest in "ab"]
+    assert History(tmp_path / "both.db").append(*entries) == 2
     file = sqlite3.connect(history.path)
     assert file.execute("PRAGMA journal_mode").fetchone() == ("wal",)
     for change in ("UPDATE entry SET cell = 'x'", "DELETE FROM entry"):

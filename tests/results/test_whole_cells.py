@@ -132,8 +132,8 @@ def test_one_camera_robot_and_target_are_as_near_as_their_covariance_says(
     assert one.camera.camera is found.cell.cameras[camera].camera
     assert one.robot.name == "ur5e"
     ends = (f"cam_{camera}", f"target_{target}")
-    mine = [view.view for view in found.views if (view.seer, view.seen) == ends]
-    assert [view.view for view in one.views] == mine
+    views = [view.view for view in found.views if (view.seer, view.seen) == ends]
+    assert [view.view for view in one.views] == views
 
 
 @pytest.mark.slow
@@ -202,9 +202,9 @@ def test_a_session_of_one_pair_has_its_rows_with_the_poses_of_their_stops(cell, 
 
 
 def test_a_pair_calibrated_by_itself_agrees_with_the_whole_cell(found, folder):
-    alone = package.calibrate(Session.load(folder / "session").of("left", "b"), level="hand-eye")
+    of_pair = package.calibrate(Session.load(folder / "session").of("left", "b"), level="hand-eye")
     for name, edge in found.of("left", "b").edges.items():
-        other = alone.edges[name]
+        other = of_pair.edges[name]
         # Of the same corners: the whole cell is nearer to the truth than the pair.
         assert misfit(other, edge.matrix) < MOST_OF_SIX
         assert edge.sigma_mm < other.sigma_mm
@@ -288,8 +288,8 @@ def test_stops_are_added_to_one_pair(folder, tmp_path):
     done("plan", folder / "later", "--add", 2, *chosen, "-o", out)
     assert len(json.loads((out / "plan.json").read_text())["stops"]) == 2
     # The calibration itself says which board it was made with.
-    alone = folder / "out" / "calibration.json"
-    (tmp_path / "calibration.json").write_text(alone.read_text())
+    file = folder / "out" / "calibration.json"
+    (tmp_path / "calibration.json").write_text(file.read_text())
     chosen = ("--camera", "hand", "--target", "floor", "--candidates", 60)
     done("plan", tmp_path, "--stops", 3, *chosen, "-o", out)
     assert json.loads((out / "plan.json").read_text())["cell"]["mount"] == "eye-in-hand"
@@ -320,7 +320,7 @@ def test_targets_are_corrected_for_the_robot_that_is_named(folder, tmp_path):
     found = correct(Calibration.load(tmp_path), wanted, q[0], robot="b")
     np.testing.assert_allclose(found.q, q, atol=1e-6)
     table = write_poses(tmp_path / "targets.csv", wanted)
-    assert len(told("correct", table, "--against", tmp_path, "--robot", "b")["targets"]) == 2
+    assert len(document_of("correct", table, "--against", tmp_path, "--robot", "b")["targets"]) == 2
     visioncal("correct", table, "--against", tmp_path, "--robot", "a").refused("no calibrated arm")
 
 
@@ -330,7 +330,7 @@ def of(camera, robot="", target=""):
     return [word for option in chosen if option[1] for word in option]
 
 
-def told(*arguments):
+def document_of(*arguments):
     return json.loads(done(*arguments, "--json"))
 
 
@@ -345,7 +345,7 @@ def test_every_pair_holds_and_what_was_pushed_is_named_by_its_own_pair_alone(fol
     against = ("--against", folder / "out")
     # The hand sees no other target by way of a robot.
     for pair in (of("left", "b"), of("hand")):
-        assert told("verify", folder / "later", *against, *pair)["passed"]
+        assert document_of("verify", folder / "later", *against, *pair)["passed"]
     bumped = later_with(folder, "cam_left", 0.002)
     seen = visioncal("verify", bumped, *against, *of("left", "a"))
     assert seen.status == 3
@@ -364,7 +364,7 @@ def test_every_pair_holds_and_what_was_pushed_is_named_by_its_own_pair_alone(fol
 def test_boards_and_pixels_are_located_in_the_base_of_any_robot(cell, folder):
     for camera, robot in (("left", "b"), ("hand", "a")):
         pair = of(camera, robot, "floor")
-        found = told("locate", folder / "later", "-c", folder / "out", *pair)
+        found = document_of("locate", folder / "later", "-c", folder / "out", *pair)
         at = truth(cell, f"base_{robot}", "target_floor")[:3, 3]
         assert len(found) >= 3
         for value in found:
@@ -373,11 +373,11 @@ def test_boards_and_pixels_are_located_in_the_base_of_any_robot(cell, folder):
     whole, plane = Calibration.load(folder / "out"), Plane.horizontal(0.02)
     px, words = np.array([[1200.0, 1000.0]]), ("-c", folder / "out", "--pixel", "1200,1000")
     for robot in ("a", "b"):
-        (seen,) = told("locate", *words, "--plane", "z=20", *of("left", robot))
+        (seen,) = document_of("locate", *words, "--plane", "z=20", *of("left", robot))
         (found,) = locate(whole, px, plane, camera="left", robot=robot)
         np.testing.assert_allclose(seen["p_base_m"], found.p_base)
     # In the plane of a board that stands still, it is on that board.
-    (seen,) = told("locate", *words, "--plane", "floor", *of("left", "b"))
+    (seen,) = document_of("locate", *words, "--plane", "floor", *of("left", "b"))
     floor = whole.between("base_b", "target_floor").matrix
     assert abs((np.array(seen["p_base_m"]) - floor[:3, 3]) @ floor[:3, 2]) < 1e-9
     visioncal("locate", *words, "--plane", "z=20", *of("left")).refused("several robots (a, b)")
@@ -397,11 +397,11 @@ def test_a_target_is_placed_on_any_flange_and_in_any_base(cell, folder, tmp_path
     # A fixture of one robot is known in the base of the other.
     out = copied(folder, tmp_path)
     done("fixture", folder / "later", "-c", out, *of("hand", "a", "floor"), "--name", "jig")
-    edge, own = (
+    edge, nearer = (
         Calibration.load(out).of("left", robot).frames["base_from_jig"].edge for robot in "ba"
     )
     assert misfit(edge, truth(cell, "base_b", "target_floor")) < MOST
-    assert edge.sigma_mm > own.sigma_mm
+    assert edge.sigma_mm > nearer.sigma_mm
     assert "base_a_from_jig" in (out / "report.html").read_text()
     # A row without the robot's pose is left out.
     session = Session.load(folder / "later").of("left", "b", "plate_b")
@@ -425,12 +425,12 @@ def test_two_whole_cells_are_compared_by_all_frames_or_by_a_pair(folder, tmp_pat
     twist[0, 3] = 2e-3
     moved = replace(whole, edges=whole.edges | {name: replace(edge, matrix=edge.matrix @ twist)})
     moved.save(tmp_path / "calibration.json")
-    found = told("diff", folder / "out", tmp_path)
+    found = document_of("diff", folder / "out", tmp_path)
     changed = [edge for edge, value in found["transforms"].items() if value["is_change"]]
     assert changed == [name]
     assert "cam_left moved" in found["findings"][1]
     assert found["mounts"] == ["whole cell"] * 2
-    pair = told("diff", folder / "out", tmp_path, *of("left", "b"))
+    pair = document_of("diff", folder / "out", tmp_path, *of("left", "b"))
     assert pair["transforms"]["base_from_cam"]["is_change"]
     assert not compare(whole, moved, camera="hand").is_change
 

@@ -54,9 +54,9 @@ def test_poses_are_reached_from_anywhere_within_the_limits(name):
         found, joints = reached(robot, pose, np.zeros(robot.joint_count), widest_rad=0.0)
         assert found.reached
         # A nanometre and a nanoradian, as promised; of five joints, the position alone.
-        there = robot.base_from_flange(joints[None])[0]
-        assert there[:3, 3] == pytest.approx(pose[:3, 3], abs=1e-9)
-        assert robot.joint_count < 6 or there == pytest.approx(pose, abs=1e-9)
+        flange = robot.base_from_flange(joints[None])[0]
+        assert flange[:3, 3] == pytest.approx(pose[:3, 3], abs=1e-9)
+        assert robot.joint_count < 6 or flange == pytest.approx(pose, abs=1e-9)
         assert (robot.lower_rad - 1e-12 <= joints).all()
         assert (joints <= robot.upper_rad + 1e-12).all()
 
@@ -157,9 +157,9 @@ def test_random_starts_lead_to_poses_in_reach_by_all_branches(name):
     # What fails ends at a limit, or near a singular posture. The search for stops tries three times
     # as many views as it still needs: a quarter that succeeds takes it a second round.
     assert reached.mean() > 0.25
-    there = robot.base_from_flange(robot.chain.encoded(positions[reached]))
+    flanges = robot.base_from_flange(robot.chain.encoded(positions[reached]))
     # A nanometre and a nanoradian, as promised.
-    np.testing.assert_allclose(there, poses[reached], atol=1e-9)
+    np.testing.assert_allclose(flanges, poses[reached], atol=1e-9)
     bounds = robot.chain.effective(np.array([robot.lower_rad, robot.upper_rad]))
     assert np.all((positions[reached] >= bounds[0]) & (positions[reached] <= bounds[1]))
     # Four starts of one pose end on several branches of most.

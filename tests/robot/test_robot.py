@@ -459,21 +459,21 @@ def assert_same_table(found, expected, atol):
 @pytest.mark.parametrize("name", robot_names())
 def test_conversions_keep_the_arm_and_come_back(name, convention):
     start = table(name)
-    there = convert_table(start, convention)
-    assert there.convention == convention
+    converted = convert_table(start, convention)
+    assert converted.convention == convention
     # Rounding of some ten products; nothing is computed anew, so the way back is exact.
-    np.testing.assert_allclose(poses(there), poses(start), rtol=0, atol=1e-14)
-    assert_same_table(convert_table(there, start.convention), start, atol=0.0)
+    np.testing.assert_allclose(poses(converted), poses(start), rtol=0, atol=1e-14)
+    assert_same_table(convert_table(converted, start.convention), start, atol=0.0)
 
 
 @pytest.mark.parametrize("other", CONVENTIONS)
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_conversions_of_any_table_come_back(convention, other):
     start = random_table(convention)
-    there = convert_table(start, other)
+    converted = convert_table(start, other)
     # d of some hundred metres where beta had been: 1e-16 of it, a few times over.
-    np.testing.assert_allclose(poses(there), poses(start), rtol=0, atol=1e-12)
-    assert_same_table(convert_table(there, convention), start, atol=1e-12)
+    np.testing.assert_allclose(poses(converted), poses(start), rtol=0, atol=1e-12)
+    assert_same_table(convert_table(converted, convention), start, atol=1e-12)
 
 
 @pytest.mark.parametrize("other", ["standard", "modified"])
@@ -482,12 +482,12 @@ def test_nearly_parallel_axes_come_back_too(name, other):
     for seed in range(5):
         robot = disturbed(name, seed)
         hayati = table_of(robot, "hayati", like=table(name))
-        there = convert_table(hayati, other)
+        converted = convert_table(hayati, other)
         # What Hayati's form is for: the common normal is far away.
-        assert np.abs(there.d_m).max() > 5.0 > 2.0 > np.abs(hayati.d_m).max()
-        for dhtable in (hayati, there):
+        assert np.abs(converted.d_m).max() > 5.0 > 2.0 > np.abs(hayati.d_m).max()
+        for dhtable in (hayati, converted):
             np.testing.assert_allclose(poses(dhtable), poses(robot), rtol=0, atol=2e-12)
-        assert_same_table(convert_table(there, "hayati"), hayati, atol=2e-12)
+        assert_same_table(convert_table(converted, "hayati"), hayati, atol=2e-12)
 
 
 def test_beta_is_chosen_for_the_axes_that_are_nearly_parallel():

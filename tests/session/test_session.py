@@ -219,14 +219,14 @@ def test_the_need_of_a_task_is_read_and_can_be_overridden(folder, tmp_path):
     edit(folder, "session.toml", "[robot]", "[need]\nmm = 0.5\nat = [0.4, 0, 0.1]\n[robot]")
     session = Session.load(folder)
     assert session.need == Need(0.5, None, (0.4, 0.0, 0.1))
-    asked = session.needing(deg=0.2)
-    assert asked.need == Need(0.5, 0.2, (0.4, 0.0, 0.1))
+    overridden = session.needing(deg=0.2)
+    assert overridden.need == Need(0.5, 0.2, (0.4, 0.0, 0.1))
     assert session.needing() is session
-    asked.save(tmp_path / "saved")
-    assert Session.load(tmp_path / "saved").need == asked.need
+    overridden.save(tmp_path / "saved")
+    assert Session.load(tmp_path / "saved").need == overridden.need
     assert plain.needing(2).need == Need(2.0)
     # The same was recorded, whatever it is to be good for.
-    assert plain.digest() == asked.digest()
+    assert plain.digest() == overridden.digest()
 
 
 def test_the_digest_sees_facts_and_not_their_spelling(folder, tmp_path):

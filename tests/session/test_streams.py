@@ -88,10 +88,12 @@ def test_a_name_that_leaves_the_folder_is_refused():
 
 def test_gaps_are_reported():
     stamps_s = np.arange(1000) / 500
-    there = (stamps_s < 0.5) | (stamps_s > 0.9)
-    (told,) = kept_session().with_streams({"robot": stream(stamp_s=stamps_s[there])}).warnings[-1:]
-    assert "in 1 place" in told
-    assert "0.404 s, 0.498 s from the start" in told
+    is_kept = (stamps_s < 0.5) | (stamps_s > 0.9)
+    (words,) = (
+        kept_session().with_streams({"robot": stream(stamp_s=stamps_s[is_kept])}).warnings[-1:]
+    )
+    assert "in 1 place" in words
+    assert "0.404 s, 0.498 s from the start" in words
     assert not parsed("stamp_s", *map(repr, stamps_s.tolist())).gaps().size
 
 

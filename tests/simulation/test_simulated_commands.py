@@ -238,8 +238,8 @@ def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
 
 def test_depth_is_off_by_what_was_asked_for(place):
     folder = place / "depth"
-    asked = ("--depth-scale", 1.02, "--depth-offset-mm", 3, "--depth-bowl-mm", 0)
-    done("simulate", folder, "--views", 1, "--mount", "eye-to-hand", *asked)
+    options = ("--depth-scale", 1.02, "--depth-offset-mm", 3, "--depth-bowl-mm", 0)
+    done("simulate", folder, "--views", 1, "--mount", "eye-to-hand", *options)
     content, _ = truth_of(folder)
     session = Session.load(folder)
     camera = session.declaration.camera
@@ -281,9 +281,9 @@ def test_an_arm_of_four_axes_is_simulated_with_a_measured_height(mount, tmp_path
         off = log(invert(edges[name]) @ edge.matrix)[free]
         assert off @ np.linalg.solve(edge.covariance[free, free], off) < MOST
     bare = replace(session, document={k: v for k, v in session.document.items() if k != "prior"})
-    asked = raised(DegenerateError, "is not determined at all", calibrate, bare)
+    refusal = raised(DegenerateError, "is not determined at all", calibrate, bare)
     step = "This arm cannot tilt: measure that offset for [prior."
-    assert asked.next_step.startswith(step)
+    assert refusal.next_step.startswith(step)
 
 
 def test_an_arm_of_four_axes_takes_no_option_of_those_with_six(tmp_path):

@@ -195,11 +195,11 @@ def detection_errors(options):
         true = cell.exact_corners[view]
         # Upside down for a detector that has a bias of its own: there its sign changes.
         ids, px = found_corners(options.target, image)
-        _, here, there = np.intersect1d(ids, true.ids, return_indices=True)
-        errors.append(px[here] - true.px[there])
+        _, found_rows, true_rows = np.intersect1d(ids, true.ids, return_indices=True)
+        errors.append(px[found_rows] - true.px[true_rows])
         ids, px = found_corners(options.target, np.ascontiguousarray(image[::-1, ::-1]))
-        _, here, there = np.intersect1d(ids, true.ids, return_indices=True)
-        errors.append(np.array(image.shape[::-1]) - 1.0 - px[here] - true.px[there])
+        _, found_rows, true_rows = np.intersect1d(ids, true.ids, return_indices=True)
+        errors.append(np.array(image.shape[::-1]) - 1.0 - px[found_rows] - true.px[true_rows])
     return np.concatenate(errors)
 
 

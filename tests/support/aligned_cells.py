@@ -30,8 +30,8 @@ def made_up_cell(seed: int) -> Calibration:
     covariance = root @ root.T
     edges = {}
     for at, name in enumerate(names):
-        mine = slice(6 * at, 6 * at + 6)
-        edge = Edge(exp(rng.normal(0.0, 0.7, 6)), covariance[mine, mine])
+        columns = slice(6 * at, 6 * at + 6)
+        edge = Edge(exp(rng.normal(0.0, 0.7, 6)), covariance[columns, columns])
         edges[f"{FRAMES[name]}_from_{name}"] = edge
     return cell_result(
         edges,

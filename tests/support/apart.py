@@ -19,8 +19,8 @@ def tubes(arm: DhArm, joints: np.ndarray) -> list[np.ndarray]:
     found = []
     for link, aside in enumerate(UR5E_ASIDE_M):
         start, end = frames[:, link, :3, 3], frames[:, link + 1, :3, 3]
-        beside = aside * frames[:, link, :3, 2]
-        found.append(np.stack([start, start + beside, end + beside, end], axis=1))
+        offset = aside * frames[:, link, :3, 2]
+        found.append(np.stack([start, start + offset, end + offset, end], axis=1))
     return found
 
 

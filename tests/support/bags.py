@@ -47,12 +47,12 @@ def motion(session: Session, period_s: float) -> tuple[np.ndarray, np.ndarray]:
     """(m,) times and (m, 4, 4) poses: from view to view, with a rest at each."""
     stops = [np.asarray(view.base_from_flange().as_matrix()) for view in session.views]
     poses = []
-    for at, (here, there) in enumerate(zip(stops, [*stops[1:], stops[-1]], strict=True)):
-        poses += [here] * round(REST_S / period_s)
-        way = log(invert(here) @ there)
+    for at, (pose, next_pose) in enumerate(zip(stops, [*stops[1:], stops[-1]], strict=True)):
+        poses += [pose] * round(REST_S / period_s)
+        way = log(invert(pose) @ next_pose)
         shares = np.linspace(0.0, 1.0, round(WAY_S / period_s))
         if at + 1 < len(stops):
-            poses += [here @ exp(way * (0.5 - 0.5 * np.cos(np.pi * share))) for share in shares]
+            poses += [pose @ exp(way * (0.5 - 0.5 * np.cos(np.pi * share))) for share in shares]
     stamps_s = 1e9 + period_s * np.arange(len(poses))
     if period_s > 0.02:
         stamps_s += np.random.default_rng(1).uniform(-0.2, 0.2, len(poses)) * period_s

@@ -60,7 +60,7 @@ def an_error(calibration: Calibration, seed: int) -> np.ndarray:
 
 def with_error(calibration: Calibration, error: np.ndarray) -> Calibration:
     """The calibration with the covariance of one (6 + k + m,) error of random size."""
-    both, size = np.outer(error, error), 6 + 4 + len(calibration.camera.camera.distortion)
+    covariance, size = np.outer(error, error), 6 + 4 + len(calibration.camera.camera.distortion)
     lens, beyond, name = slice(6, size), slice(size, None), next(iter(calibration.edges))
     others = ((0, 0), (0, 6 * (len(calibration.edges) - 1)))
     field = calibration.camera.field
@@ -68,15 +68,15 @@ def with_error(calibration: Calibration, error: np.ndarray) -> Calibration:
         field = replace(
             field,
             root=error[beyond, None],
-            intrinsics_covariance=both[beyond, lens],
-            edge_covariance=np.pad(both[beyond, :6], others),
+            intrinsics_covariance=covariance[beyond, lens],
+            edge_covariance=np.pad(covariance[beyond, :6], others),
         )
     camera = replace(
         calibration.camera,
         estimated=True,
-        covariance=both[lens, lens],
-        edge_covariance=np.pad(both[lens, :6], others),
+        covariance=covariance[lens, lens],
+        edge_covariance=np.pad(covariance[lens, :6], others),
         field=field,
     )
-    edge = replace(calibration.edges[name], covariance=both[:6, :6])
+    edge = replace(calibration.edges[name], covariance=covariance[:6, :6])
     return replace(calibration, edges={**calibration.edges, name: edge}, camera=camera)

@@ -10,8 +10,8 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 def chromium(page: Path, *flags: str) -> None:
     """Opens a page and ends, having done what the flags say."""
     profile = page.with_name("profile")
-    alone = ["--headless", "--no-sandbox", "--hide-scrollbars", f"--user-data-dir={profile}"]
-    command = [CHROMIUM, *alone, *flags, page.absolute().as_uri()]
+    options = ["--headless", "--no-sandbox", "--hide-scrollbars", f"--user-data-dir={profile}"]
+    command = [CHROMIUM, *options, *flags, page.absolute().as_uri()]
     subprocess.run(command, check=True, capture_output=True)
 
 

@@ -60,10 +60,10 @@ def known_of(
     model = load_robot(cell.options.robot) if robot is None else robot
     known = joints or robot is not None
     stops = {sight.view: sight.stop for sight in cell.sights}
-    told = {view: cell.robot.joints[at] for view, at in stops.items()} if joints else {}
+    joints_of = {view: cell.robot.joints[at] for view, at in stops.items()} if joints else {}
     reported = RobotReport(
         {view: cell.robot.base_from_flange[at] for view, at in stops.items()},
-        matched=MatchedJoints(model, told) if known else None,
+        matched=MatchedJoints(model, joints_of) if known else None,
     )
     known = replace(RunState(session_of(cell)), robots={"": reported}, **changes)
     return detect_targets(known, {view_corners.view: view_corners for view_corners in cell.corners})

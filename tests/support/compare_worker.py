@@ -56,7 +56,7 @@ def arm(calibration, **at):
 
 def main():
     # A command has no input, and sets up the streams that it finds.
-    asked, sys.stdin = sys.stdin, io.StringIO()
+    requests, sys.stdin = sys.stdin, io.StringIO()
     answers, sys.stdout = sys.stdout, sys.stderr
     warnings.simplefilter("ignore")
     jobs = {"command": command, "located": located, "arm": arm}
@@ -64,7 +64,7 @@ def main():
         from support import core_worker
 
         jobs |= {name: getattr(core_worker, name) for name in jobs}
-    for line in asked:
+    for line in requests:
         job, begun = json.loads(line), used_s()
         try:
             done = jobs[job.pop("do")](**job)

@@ -108,8 +108,8 @@ def located(calibration, looks):
     keys += [("effect", effect.name) for effect in at_looks(fit, camera)]
     values, covariance = fit.state.values, fit.covariance(*keys)
     px_sigma = fit.sizes.get(f"px {camera}", 0.0)
-    own = fit.unknowns.fields.get(camera)
-    left = 0.0 if own is None else fit.sizes[f"field {camera}"] ** 2
+    field = fit.unknowns.fields.get(camera)
+    left = 0.0 if field is None else fit.sizes[f"field {camera}"] ** 2
     found = []
     for look in looks:
         spread = np.zeros((3, len(covariance)))
@@ -129,7 +129,7 @@ def located(calibration, looks):
             moved = {**look, "px": np.array(look["px"]) + step}
             slope = (place(fit, camera, values, moved) - centre) / 1e-3
             # Where no corner was seen, a field may be anything of its size.
-            unseen = 0.0 if own is None else left * float(own.variance(moved["px"][None])[0])
+            unseen = 0.0 if field is None else left * float(field.variance(moved["px"][None])[0])
             total += (px_sigma**2 + unseen) * np.outer(slope, slope)
         # A lens that focuses anew does so for this image, too.
         refocused = fit.sizes.get(f"focus jitter {camera}", 0.0)

@@ -138,14 +138,14 @@ def follow(*words: object, steps: int = 6, run: Run = visioncal) -> Followed:
     runs, done, looked = [_called(run, current)], list[str](), set[str]()
     while True:
         trail = _Trail(current, runs, done)
-        assert runs[-1].status in (0, 2, 3), trail.told("it ends otherwise")
+        assert runs[-1].status in (0, 2, 3), trail.story("it ends otherwise")
         found = next(_next(runs[-1], current, looked, run, trail), None)
         if found is None:
             return Followed(tuple(runs), tuple(done), current)
-        assert found.key not in {item.partition("\n")[0] for item in done}, trail.told(
+        assert found.key not in {item.partition("\n")[0] for item in done}, trail.story(
             f"advice comes again: {found.words} {found.command}"
         )
-        assert len(done) < steps, trail.told(f"it does not end in {steps} steps")
+        assert len(done) < steps, trail.story(f"it does not end in {steps} steps")
         done.append(f"{found.key}\n{found.words}")
         current, ended = _do(found, current, run, trail)
         runs.append(ended or _called(run, current))
@@ -173,14 +173,14 @@ class _Trail:
     runs: list[Done]
     done: list[str]
 
-    def told(self, why: str) -> str:
+    def story(self, why: str) -> str:
         """What happened, for a failed test."""
         steps = [f"-> {item}" for item in self.done]
         steps += [""] * (len(self.runs) - len(steps))
-        both = [
+        lines = [
             line for run, step in zip(self.runs, steps, strict=False) for line in (run.said, step)
         ]
-        return "\n".join([f"{shlex.join(self.current)}: {why}", *both])
+        return "\n".join([f"{shlex.join(self.current)}: {why}", *lines])
 
 
 def _called(run: Run, words: Sequence[str]) -> Done:
@@ -194,7 +194,7 @@ def _next(
 ) -> Iterator[Advice]:
     """The advice that changes something; the commands that show something must run."""
     for item in printed_advice(said.said):
-        assert not _PLACEHOLDER.search(item.command), trail.told(f"a placeholder: {item.command}")
+        assert not _PLACEHOLDER.search(item.command), trail.story(f"a placeholder: {item.command}")
         # What was typed before is to be typed again after a person's work.
         is_again = not item.is_edit and all(_bare(call) == _bare(current) for call in item.calls)
         if item.changes and not is_again:
@@ -203,7 +203,7 @@ def _next(
             looked.add(item.key)
             for call in item.calls:
                 ended = _called(run, call)
-                assert ended.status == 0, trail.told(f"{item.command}: {ended.said}")
+                assert ended.status == 0, trail.story(f"{item.command}: {ended.said}")
     if said.status == 2:
         last = said.err.strip().splitlines()[-1]
         if _FOLDER.search(last) or _FOR.search(last):
@@ -228,7 +228,9 @@ def _do(
         if call[0] == "convert" and ended.status == 2:
             # It asks for what no file states; the rest of the line would not be run.
             return tuple(call), ended
-        assert ended.status in allowed, trail.told(f"{advice.command}: {ended.status} {ended.said}")
+        assert ended.status in allowed, trail.story(
+            f"{advice.command}: {ended.status} {ended.said}"
+        )
     is_judged = ended is not None and last[0] in (*_JUDGES, current[0])
     edited = advice.is_edit and _edit(advice.words, _folder(current), trail)
     if edited or not is_judged:
@@ -252,7 +254,7 @@ def _edit(said: str, folder: Path, trail: _Trail) -> bool:
         entries = _ONE.findall(match[1])
         # A place stands behind the last of its entries.
         for at, (key, value, _) in enumerate(entries):
-            place = next((own for _, _, own in entries[at:] if own), place)
+            place = next((entry_place for _, _, entry_place in entries[at:] if entry_place), place)
             _write(place, key, tomllib.loads(f"v = {value}")["v"], folder, trail)
     for match in _DELETE.finditer(said):
         for name in re.split(r", | and ", match[1]):
@@ -283,7 +285,7 @@ def _write(place: str, key: str, value: object, folder: Path, trail: _Trail) -> 
         return
     board = str(tomllib.loads(session.read_text("utf-8"))["target"])
     named = place if place.endswith(".toml") and "'" not in place else board
-    assert named.endswith(".toml"), trail.told(f"{named} is no file of the user's")
+    assert named.endswith(".toml"), trail.story(f"{named} is no file of the user's")
     _change(folder / named, lambda it: _with(it, key, value), trail)
 
 
@@ -292,7 +294,7 @@ def _change(path: Path, change: Callable[[dict[str, Any]], object], trail: _Trai
     before = tomli_w.dumps(document)
     change(document)
     after = tomli_w.dumps(document)
-    assert after != before, trail.told(f"{path} is so already")
+    assert after != before, trail.story(f"{path} is so already")
     path.write_text(after, "utf-8")
 
 
@@ -322,11 +324,11 @@ def _change_rows(folder: Path, change: Callable[..., Any], trail: _Trail) -> Non
 
     def changed(rows: list[dict[str, str]]) -> list[dict[str, str]]:
         rows = change(rows)
-        assert rows, trail.told("it deletes all rows")
+        assert rows, trail.story("it deletes all rows")
         return rows
 
     edit_rows(folder, changed)
-    assert (folder / "views.csv").read_bytes() != before, trail.told("no such rows or columns")
+    assert (folder / "views.csv").read_bytes() != before, trail.story("no such rows or columns")
 
 
 def _scale(folder: Path, columns: str, factor: float, trail: _Trail) -> None:
@@ -371,18 +373,18 @@ def _typed(said: str, current: tuple[str, ...], trail: _Trail) -> tuple[str, ...
                 typed[typed.index(name) + 1] = value
             else:
                 typed += [name, value] if value else [name]
-        assert tuple(typed) != current, trail.told(f"{options} was given already")
+        assert tuple(typed) != current, trail.story(f"{options} was given already")
         return tuple(typed)
     if folder := _FOLDER.search(said):
         first = next(at for at, word in enumerate(current[1:], 1) if not word.startswith("-"))
         return (*current[:first], folder[1], *current[first + 1 :])
     meant, other = _MEANT.search(said), _FOR.search(said)
-    assert meant or other, trail.told("nothing is to be done")
+    assert meant or other, trail.story("nothing is to be done")
     wrong, right = (meant[1], meant[2].rstrip("?.,")) if meant else (other[2], other[1])
     if wrong in current:
         return tuple(right if word == wrong else word for word in current)
     path = _folder(current) / "session.toml"
     text = path.read_text("utf-8")
-    assert wrong in text, trail.told(f"{wrong} is nowhere")
+    assert wrong in text, trail.story(f"{wrong} is nowhere")
     path.write_text(text.replace(wrong, right), "utf-8")
     return current

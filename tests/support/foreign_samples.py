@@ -223,9 +223,9 @@ def matrices_in_rows(folder: Path) -> Recording:
 
 def numbered_yaml(folder: Path) -> Recording:
     """A mapping from numbers to matrices each for the robot and for the camera."""
-    both = {"base_T_ee": BASE_FROM_FLANGE, "cam_T_board": CAM_FROM_TARGET}
+    sides = {"base_T_ee": BASE_FROM_FLANGE, "cam_T_board": CAM_FROM_TARGET}
     text = ""
-    for name, poses in both.items():
+    for name, poses in sides.items():
         rows = poses.reshape(-1, 16).tolist()
         text += f"{name}:\n" + "".join(f"  '{at}': {row}\n" for at, row in enumerate(rows, 1))
     return _in_hand(folder / "log.yml", text)
@@ -233,13 +233,13 @@ def numbered_yaml(folder: Path) -> Recording:
 
 def lettered_quaternions(folder: Path) -> Recording:
     """Records whose names say the unit and the order of quaternions."""
-    both = (quaternions(poses).tolist() for poses in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
+    sides = (quaternions(poses).tolist() for poses in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
     rows = [
         {
             "robot": {"position_m": robot[:3], "quaternion_wxyz": [robot[6], *robot[3:6]]},
             "target": {"position_m": target[:3], "quaternion_xyzw": target[3:]},
         }
-        for robot, target in zip(*both, strict=True)
+        for robot, target in zip(*sides, strict=True)
     ]
     document = json.dumps({"samples": rows})
     return _in_hand(folder / "log.json", document)
@@ -380,8 +380,8 @@ def alternating(folder: Path) -> Recording:
 
 def halves(folder: Path) -> Recording:
     """The robot's poses, an empty line, and the target's."""
-    both = (quaternions(at).tolist() for at in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
-    blocks = ("\n".join(" ".join(map(repr, row)) for row in rows) for rows in both)
+    sides = (quaternions(at).tolist() for at in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
+    blocks = ("\n".join(" ".join(map(repr, row)) for row in rows) for rows in sides)
     return _in_hand(folder / "data.txt", "\n\n\n".join(blocks) + "\n")
 
 

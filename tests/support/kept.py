@@ -41,11 +41,11 @@ def assert_same_evidence(one: tuple[ViewEvidence, ...], other: tuple[ViewEvidenc
         if a.corners is not None and b.corners is not None:
             assert (a.corners.view, a.corners.blur_px) == (b.corners.view, b.corners.blur_px)
             pairs += [(a.corners.ids, b.corners.ids), (a.corners.px, b.corners.px)]
-        for mine, theirs in pairs:
-            assert (mine is None) == (theirs is None)
-            if mine is not None:
-                assert mine.dtype == theirs.dtype
-                assert np.array_equal(mine, theirs)
+        for array, other_array in pairs:
+            assert (array is None) == (other_array is None)
+            if array is not None:
+                assert array.dtype == other_array.dtype
+                assert np.array_equal(array, other_array)
 
 
 def kept_session() -> Session:

@@ -80,10 +80,10 @@ def message(kind: str, words: str) -> Message:
     return kind, [float(figure) for figure in _FIGURE.findall(words)]
 
 
-def answer_of(session: Session | Path, **asked: Any) -> Answer:
+def answer_of(session: Session | Path, **options: Any) -> Answer:
     """Calibrates; a refusal is an answer, too."""
     try:
-        result = visioncal.calibrate(session, **asked)
+        result = visioncal.calibrate(session, **options)
     except visioncal.VisioncalError as error:
         return Answer("refused", message(type(error).__name__, error.message), {}, {})
     with tempfile.TemporaryDirectory() as folder:
@@ -152,31 +152,41 @@ def cases() -> dict[str, Callable[[], Answer]]:
         for seed in seeds or (0,):
             found[f"{name}, {seed}"] = _cell(replace(options, seed=seed), **changes)
 
-    alone = {"joints": False}
-    add("in hand, lens given", _FINE, 1, 2, **alone)
-    add("in hand, lens estimated", _OPEN, 1, 2, **alone)
-    add("to hand, lens given", _HAND, 1, 2, **alone)
-    add("to hand, lens estimated", replace(_OPEN, mount=TO_HAND), 1, 2, **alone)
-    add("coarse robot", _COARSE, 1, **alone)
-    add("small tilts", replace(_FINE, tilt_rad=(0.0, 0.17)), 1, **alone)
-    add("6 views", replace(_FINE, views=6), 1, **alone)
-    add("2 views", replace(_FINE, views=2), 1, **alone)
-    add("4 views, lens estimated", replace(_OPEN, views=4), 1, **alone)
-    add("one axis", replace(_FINE, motion="one_axis"), 1, **alone)
-    add("translation", replace(_HAND, motion="translation"), 1, **alone)
-    add("closed form", _FINE, 1, solver="park", **alone)
+    poses_only = {"joints": False}
+    add("in hand, lens given", _FINE, 1, 2, **poses_only)
+    add("in hand, lens estimated", _OPEN, 1, 2, **poses_only)
+    add("to hand, lens given", _HAND, 1, 2, **poses_only)
+    add("to hand, lens estimated", replace(_OPEN, mount=TO_HAND), 1, 2, **poses_only)
+    add("coarse robot", _COARSE, 1, **poses_only)
+    add("small tilts", replace(_FINE, tilt_rad=(0.0, 0.17)), 1, **poses_only)
+    add("6 views", replace(_FINE, views=6), 1, **poses_only)
+    add("2 views", replace(_FINE, views=2), 1, **poses_only)
+    add("4 views, lens estimated", replace(_OPEN, views=4), 1, **poses_only)
+    add("one axis", replace(_FINE, motion="one_axis"), 1, **poses_only)
+    add("translation", replace(_HAND, motion="translation"), 1, **poses_only)
+    add("closed form", _FINE, 1, solver="park", **poses_only)
     for count in (2, 4, 6):
-        add(f"{count} wrong", replace(_FINE, wrong_views=count), 1, **alone)
-        add(f"{count} wrong to hand", replace(_OPEN, mount=TO_HAND, wrong_views=count), 1, **alone)
-    add("lens 1 px off", replace(_FINE, lens_mismatch_px=1.0), 1, **alone)
-    add("lens 1 px off to hand", replace(_HAND, lens_mismatch_px=1.0), 1, **alone)
-    add("bow", replace(_FINE, board_bow_m=5e-4), 1, **alone)
-    add("size", replace(_FINE, board_scale=1.005), 1, **alone)
-    add("two boards", replace(_FINE, views=24, second=_SHELF), 1, **alone)
-    add("two boards to hand", replace(_HAND, views=24, second=_SHELF), 1, **alone)
-    add("two boards, 3 wrong", replace(_FINE, views=24, second=_SHELF, wrong_views=3), 1, **alone)
-    add("wrong arm, poses", _WRONG_ARM, 1, **alone)
-    add("wrong arm, poses to hand", replace(_WRONG_ARM, mount=TO_HAND), 1, **alone)
+        add(f"{count} wrong", replace(_FINE, wrong_views=count), 1, **poses_only)
+        add(
+            f"{count} wrong to hand",
+            replace(_OPEN, mount=TO_HAND, wrong_views=count),
+            1,
+            **poses_only,
+        )
+    add("lens 1 px off", replace(_FINE, lens_mismatch_px=1.0), 1, **poses_only)
+    add("lens 1 px off to hand", replace(_HAND, lens_mismatch_px=1.0), 1, **poses_only)
+    add("bow", replace(_FINE, board_bow_m=5e-4), 1, **poses_only)
+    add("size", replace(_FINE, board_scale=1.005), 1, **poses_only)
+    add("two boards", replace(_FINE, views=24, second=_SHELF), 1, **poses_only)
+    add("two boards to hand", replace(_HAND, views=24, second=_SHELF), 1, **poses_only)
+    add(
+        "two boards, 3 wrong",
+        replace(_FINE, views=24, second=_SHELF, wrong_views=3),
+        1,
+        **poses_only,
+    )
+    add("wrong arm, poses", _WRONG_ARM, 1, **poses_only)
+    add("wrong arm, poses to hand", replace(_WRONG_ARM, mount=TO_HAND), 1, **poses_only)
     add("sound arm", replace(_FINE, views=40, branches=True), 1)
     add("wrong arm", _WRONG_ARM, 1, 2)
     add("wrong arm to hand", replace(_WRONG_ARM, mount=TO_HAND), 1)
@@ -248,8 +258,8 @@ def _away(edge: Mapping[str, Any], then: Mapping[str, Any]) -> float:
     now, base = (RigidTransform.from_matrix(np.vstack([at["matrix"], [0.0, 0.0, 0.0, 1.0]]))
                  for at in (edge, then))  # fmt: skip
     moved, sigma = np.abs((base.inv() * now).as_exp_coords()), np.array(then["sigma"])
-    asked = sigma > 0.0
-    return float((moved[asked] / sigma[asked]).max(initial=0.0))
+    is_uncertain = sigma > 0.0
+    return float((moved[is_uncertain] / sigma[is_uncertain]).max(initial=0.0))
 
 
 def sizes_apart(answer: Answer, before: Mapping[str, Any]) -> float:

@@ -28,9 +28,11 @@ def write_dataset(folder: Path, session: Session, images: Path, version: str, ro
     """Writes a data set whose arm stands at each view, and moves on to the next."""
     stops = np.array([view.joints_rad for view in session.views])
     rows, shown = [], []
-    for view, here, there in zip(session.views, stops, [*stops[1:], stops[-1]], strict=True):
+    for view, joints, next_joints in zip(
+        session.views, stops, [*stops[1:], stops[-1]], strict=True
+    ):
         ways = np.linspace(0.0, 1.0, WAY)[:, None]
-        rows += [*np.tile(here, (REST, 1)), *(here + (there - here) * ways)]
+        rows += [*np.tile(joints, (REST, 1)), *(joints + (next_joints - joints) * ways)]
         shown += [view.image] * (REST + WAY)
     state = np.rad2deg(np.array(rows)) + np.random.default_rng(0).normal(0.0, 1e-3, (len(rows), 1))
     state = np.column_stack([state, np.zeros(len(state))]).astype(np.float32)

@@ -21,17 +21,17 @@ def robot_with_bodies(built: DynamicArm) -> Robot:
     rows = []
     for row, body in zip(document["joint"], built.bodies, strict=True):
         inertia = body.inertia_kg_m2[_ROWS, _COLUMNS].tolist()
-        told = {"mass_kg": body.kg, "com_m": body.centre_m.tolist(), "inertia_kg_m2": inertia}
-        rows.append({**row, **told})
+        inertial = {"mass_kg": body.kg, "com_m": body.centre_m.tolist(), "inertia_kg_m2": inertia}
+        rows.append({**row, **inertial})
     return Robot.from_document({**document, "joint": rows})
 
 
 def true_base(base: BaseModel, built: DynamicArm) -> FloatArray:
     """The base parameters that a simulated arm really has."""
     gears = built.gears
-    own = {"Fc": gears.coulomb, "Fv": gears.viscous, "offset": gears.offset}
-    own["Ia"] = gears.motor_inertia
-    friction = np.stack([own[symbol] for symbol in base.model.terms.symbols], axis=1)
+    values = {"Fc": gears.coulomb, "Fv": gears.viscous, "offset": gears.offset}
+    values["Ia"] = gears.motor_inertia
+    friction = np.stack([values[symbol] for symbol in base.model.terms.symbols], axis=1)
     links = robot_with_bodies(built).inertias.values
     return base.of(np.concatenate([links.ravel(), friction.ravel()]))
 

@@ -43,9 +43,11 @@ def served(*words: object, host: str = "127.0.0.1", folder: Path | None = None):
     address = f"{host}:{free_port()}"
     words = [sys.executable, played.__file__, *map(str, words), "--page", "--address", address]
     # NiceGUI would take the process for a test of itself.
-    own = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
+    }
     with tempfile.NamedTemporaryFile("w+", suffix=".txt") as output:
-        process = Process(words, output, env=own, cwd=folder, text=True)
+        process = Process(words, output, env=environment, cwd=folder, text=True)
         try:
             for _ in range(300):
                 assert process.poll() is None, process.said()
@@ -86,7 +88,7 @@ def opened(browser, url: str):
     context.set_default_timeout(PATIENT_MS)
     faults = []
 
-    def asked(dialog):
+    def on_dialog(dialog):
         faults.append(f"dialog: {dialog.message}")
         dialog.dismiss()
 
@@ -97,7 +99,7 @@ def opened(browser, url: str):
             faults.append(message.text)
 
     context.on("weberror", lambda error: faults.append(str(error.error)))
-    context.on("dialog", asked)
+    context.on("dialog", on_dialog)
     context.on("console", wrote)
     page = context.new_page()
     page.goto(url)

@@ -113,10 +113,10 @@ def of_shares(
 
 def changes(world: str, pairs: Sequence[Pair]) -> Iterator[Change]:
     """All comparisons of a world."""
-    both = [pair for pair in pairs if pair.before.errors and pair.after.errors]
+    answered = [pair for pair in pairs if pair.before.errors and pair.after.errors]
     found: list[Change | None] = []
-    for unit in dict.fromkeys(unit for pair in both for unit in pair.before.errors):
-        sizes = [(pair.before.errors[unit], pair.after.errors[unit]) for pair in both
+    for unit in dict.fromkeys(unit for pair in answered for unit in pair.before.errors):
+        sizes = [(pair.before.errors[unit], pair.after.errors[unit]) for pair in answered
                  if unit in pair.before.errors and unit in pair.after.errors]  # fmt: skip
         found.append(of_ratios(world, unit, sizes))
     squares = [(pair.before.nees, pair.after.nees) for pair in pairs]

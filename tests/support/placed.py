@@ -39,6 +39,6 @@ def fixture(matrix=BASE_FROM_FIXTURE, **changes):
     return {FIXTURE: frame(matrix, **changes)}
 
 
-def alone(*frames):
+def frame_file(*frames):
     """A file of frames without a calibration."""
     return FrameFile({name: value for some in frames for name, value in some.items()})

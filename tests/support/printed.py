@@ -164,14 +164,14 @@ def photographed(print_, width_m, camera, pose, look=Look(), seed=0, corner_m=(0
     covers = _covers(rng, look.covered, size, corner_m)
     total, moments = 0.0, 31 if look.twist else 1
     for k in range(moments):
-        own = pose
+        moved_pose = pose
         if look.twist:
             at = (k + 0.5) / moments - 0.5
             turn, place = np.eye(4), at * np.array(look.twist)
             turn[:3, :3] = Rotation.from_rotvec(place[3:]).as_matrix()
             turn[:3, 3] = place[:3]
-            own = turn @ pose
-        hit = rays @ np.linalg.inv(np.column_stack([own[:3, :2], own[:3, 3]])).T
+            moved_pose = turn @ pose
+        hit = rays @ np.linalg.inv(np.column_stack([moved_pose[:3, :2], moved_pose[:3, 3]])).T
         on = hit[:, :2] / hit[:, 2:] - corner_m
         at = (on / texel - 0.5 + 2).astype(np.float32).reshape(len(v), len(u), 2)
         grey = cv2.remap(
@@ -257,5 +257,5 @@ def photographed_cell(
         for at, (pose, look) in enumerate(zip(simulated.cam_from_target, looks, strict=True))
     ]  # fmt: skip
     flanges = simulated.robot.base_from_flange
-    told = {"resolution": list(camera.resolution)}
-    return Session.from_arrays(images, flanges, target, camera=told), simulated
+    camera_table = {"resolution": list(camera.resolution)}
+    return Session.from_arrays(images, flanges, target, camera=camera_table), simulated

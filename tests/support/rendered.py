@@ -175,8 +175,8 @@ def _covered(x, y, lines, light, ink):
     cells = [[light[at_y + j, at_x + i] for i in (0, 1)] for j in (0, 1)]
     # Dark grows by the ink: an edge from dark to light moves towards the light side.
     share_x = [_beyond(wide_x, off_x - ink * (row[1] - row[0])) for row in cells]
-    own = np.where(off_x > 0, cells[1][1] - cells[0][1], cells[1][0] - cells[0][0])
-    share_y = _beyond(wide_y, off_y - ink * own)
+    rise = np.where(off_x > 0, cells[1][1] - cells[0][1], cells[1][0] - cells[0][0])
+    share_y = _beyond(wide_y, off_y - ink * rise)
     upper, lower = (
         row[0] + (row[1] - row[0]) * share for row, share in zip(cells, share_x, strict=True)
     )

@@ -46,8 +46,10 @@ def changed(findings, **changes):
         shown = [*shown, ViewResult(90, False, HELD_BACK, **figures)]
     changes["views"] = shown
     for name, part in PARTS.items():
-        mine = {change: changes.pop(change) for change in list(changes) if hasattr(part, change)}
-        if mine:
+        part_changes = {
+            change: changes.pop(change) for change in list(changes) if hasattr(part, change)
+        }
+        if part_changes:
             (now,) = getattr(findings, name)
-            changes[name] = (replace(now, **mine),)
+            changes[name] = (replace(now, **part_changes),)
     return replace(findings, **changes)

@@ -31,11 +31,11 @@ def beside_pose(part, rows):
     posed = np.zeros((len(heads), 6, 2 * functions))
     pulls, squares = part.pulls.copy(), part.squares.copy()
     for row in np.flatnonzero(rows):
-        own = part.heads[row, :6]
-        inverse = np.linalg.pinv(own[:, :6], hermitian=True)
-        heads[row] -= own[:, :h].T @ inverse @ own
-        pulls[row] -= own[:, -1] @ inverse @ own[:, h:-1]
-        squares[row] -= own[:, -1] @ inverse @ own[:, -1]
+        head = part.heads[row, :6]
+        inverse = np.linalg.pinv(head[:, :6], hermitian=True)
+        heads[row] -= head[:, :h].T @ inverse @ head
+        pulls[row] -= head[:, -1] @ inverse @ head[:, h:-1]
+        squares[row] -= head[:, -1] @ inverse @ head[:, -1]
         if functions:
-            posed[row] = np.linalg.cholesky(inverse).T @ own[:, h:-1]
+            posed[row] = np.linalg.cholesky(inverse).T @ head[:, h:-1]
     return replace(part, heads=heads, pulls=pulls, squares=squares, posed=posed, sign=-1.0)

@@ -94,9 +94,9 @@ def test_intervals_of_repeatability_cover_it():
 
 
 def test_repeatability_bounds_stay_above_zero_by_chance():
-    low, _, high, alone = _repeatability(1e-12 * np.eye(3), 1e-10 * np.eye(3), 10)
+    low, _, high, device_rp = _repeatability(1e-12 * np.eye(3), 1e-10 * np.eye(3), 10)
     assert low == 0.0
-    assert 0.3 * alone < high < 2.0 * alone
+    assert 0.3 * device_rp < high < 2.0 * device_rp
 
 
 def labelled(session: Session, **columns) -> Session:
@@ -165,17 +165,17 @@ def test_the_cube_is_reached_and_has_the_standards_proportions(arm):
 
 
 def test_the_commands_write_a_table_a_page_and_the_certificate(tmp_path, measuring):
-    told = command("plan", "ur10e", "--standard", "iso9283", "--stops", 6, "-o", tmp_path / "plan")
-    assert "five poses in 6 cycles" in told.good().out
+    done = command("plan", "ur10e", "--standard", "iso9283", "--stops", 6, "-o", tmp_path / "plan")
+    assert "five poses in 6 cycles" in done.good().out
     with (tmp_path / "plan" / "stops.csv").open() as file:
         groups = [row["group"] for row in csv.DictReader(file)]
     assert groups == ["P5", "P4", "P3", "P2", "P1"] * 6
     session_of(shop_of(0.1, np.tile(FIVE, (6, 1))), name="cycles").save(tmp_path / "cycles")
     (tmp_path / "out").mkdir()
     measuring.save(tmp_path / "out" / "calibration.json")
-    asked = ("verify", tmp_path / "cycles", "--against", tmp_path / "out", "--standard", "iso9283")
-    told = command(*asked, "-o", tmp_path / "out").good()
-    assert "P5, 6 cycles: AP" in told.out
+    words = ("verify", tmp_path / "cycles", "--against", tmp_path / "out", "--standard", "iso9283")
+    done = command(*words, "-o", tmp_path / "out").good()
+    assert "P5, 6 cycles: AP" in done.out
     document = json.loads((tmp_path / "out" / "iso9283.json").read_text())
     assert document["standard"] == "ISO 9283:1998"
     assert "RP [mm]" in (tmp_path / "out" / "iso9283.html").read_text()

@@ -163,10 +163,10 @@ def test_the_command_writes_beside_and_never_over_the_unloaded_arm(tmp_path, unl
     # Its steps name it, as those of a calibration by a command do.
     verdict = unloaded.verdict.with_paths(tmp_path / "unloaded", first)
     replace(unloaded, verdict=verdict).save(first / "calibration.json")
-    asked = ("calibrate", tmp_path / "loaded", "--against", first, "-o")
-    command(*asked, first).refused("is the calibration of the unloaded arm itself")
-    told = command(*asked, tmp_path / "stiff").good()
-    assert "joint_2" in told.out
+    words = ("calibrate", tmp_path / "loaded", "--against", first, "-o")
+    command(*words, first).refused("is the calibration of the unloaded arm itself")
+    done = command(*words, tmp_path / "stiff").good()
+    assert "joint_2" in done.out
     # Steps are taken with the stiffness just found.
-    assert f"correct targets.csv --against {tmp_path / 'stiff'}" in told.out
+    assert f"correct targets.csv --against {tmp_path / 'stiff'}" in done.out
     assert "10 to 50 N" in (tmp_path / "stiff" / "report.html").read_text()

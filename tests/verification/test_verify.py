@@ -146,18 +146,18 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known():
     warm = tuple(replace(view, numbers={"ambient_c": 33.0}) for view in session.views)
     also = {"failed": False, "collision": True, "now": created + timedelta(days=200)}
     evaluated = triggers_of(replace(session, views=warm), calibration, **also)
-    told = {trigger.quantity: trigger for trigger in evaluated}
-    assert {name: trigger.state for name, trigger in told.items()} == {
+    by_quantity = {trigger.quantity: trigger for trigger in evaluated}
+    assert {name: trigger.state for name, trigger in by_quantity.items()} == {
         "failed_check": "quiet",
         "collision": "fired",
         "ambient_change_k": "fired",
         "payload_change_kg": "unknown",
         "age_days": "quiet",
     }
-    assert "12 K (limit 10)" in told["ambient_change_k"].words
-    assert told["age_days"].value == 200.0
-    own = {"ambient_change_k": 15.0, "age_days": 180.0, "payload_change_kg": None}
-    other = triggers_of(replace(session, views=warm), calibration, limits=own, **also)
+    assert "12 K (limit 10)" in by_quantity["ambient_change_k"].words
+    assert by_quantity["age_days"].value == 200.0
+    limits = {"ambient_change_k": 15.0, "age_days": 180.0, "payload_change_kg": None}
+    other = triggers_of(replace(session, views=warm), calibration, limits=limits, **also)
     assert {trigger.quantity for trigger in other if trigger.state == "fired"} == {
         "collision",
         "age_days",
@@ -277,9 +277,9 @@ def test_a_change_is_reported_with_its_size(place, name):
     assert words in said
     # Whatever stands still moves as much in a base that was pushed.
     assert ("or the robot's base was pushed" in said) == (expected == ["board"])
-    told = to_document(found, ())["changes"][0]
+    document = to_document(found, ())["changes"][0]
     if name == "two":
-        assert set(told) >= {"camera", "board"}
+        assert set(document) >= {"camera", "board"}
     if true is not None:
         explained = found.named[0].explained
         error = explained.values - true
@@ -287,9 +287,9 @@ def test_a_change_is_reported_with_its_size(place, name):
         # Chi-square of six exceeds 22.5 in one case of a thousand, of one or two values 16.
         assert error @ np.linalg.solve(explained.covariance, error) < 22.5
     if name == "bumped camera":
-        assert told["moved_mm"] == pytest.approx(1.0, abs=4 * told["sigma_mm"])
+        assert document["moved_mm"] == pytest.approx(1.0, abs=4 * document["sigma_mm"])
     if name == "slip":
-        assert told["offset_deg"] == pytest.approx(-0.05, abs=4 * told["sigma_deg"])
+        assert document["offset_deg"] == pytest.approx(-0.05, abs=4 * document["sigma_deg"])
     if name == "other board":
         assert found.named[0].explained.values[-1] == pytest.approx(-0.01, abs=5e-4)
         anew = checked(place, np.random.default_rng(1), change, board_placed_anew=True)
@@ -393,9 +393,9 @@ def test_one_of_two_boards_that_moved_is_named():
     # Some stops show both.
     assert len(seen.problem) > seen.stops == 24
     pushed = exp(np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0]))
-    mine = (shown[list(seen.views)] == 1)[:, None, None]
+    is_shelf = (shown[list(seen.views)] == 1)[:, None, None]
     observations = seen.problem.observations
-    measured = np.where(mine, observations.measured @ pushed, observations.measured)
+    measured = np.where(is_shelf, observations.measured @ pushed, observations.measured)
     moved = replace(observations, measured=measured)
     found = check(replace(seen, problem=replace(seen.problem, observations=moved)), prior)
     assert names(found) == [f"board {tuple(prior.targets)[1]}"]
@@ -405,12 +405,12 @@ def test_one_of_two_boards_that_moved_is_named():
     refused = raised(DataError, "several boards", check, seen, prior, board_placed_anew=True)
     assert "the one that moved is named" in refused.next_step
     # A session's only board needs no name: it is that with an equal print.
-    both = cell_session(cell, "both", seen="poses")
-    document = {key: value for key, value in both.document.items() if key != "targets"}
-    for name, board in both.targets.items():
-        views = [replace(view, text={}) for view in both.views if view.text["target"] == name]
-        alone = replace(both, document=document, target=board, targets={}, views=tuple(views))
-        later = predict_stops(alone, prior)
+    session = cell_session(cell, "both", seen="poses")
+    document = {key: value for key, value in session.document.items() if key != "targets"}
+    for name, board in session.targets.items():
+        views = [replace(view, text={}) for view in session.views if view.text["target"] == name]
+        of_board = replace(session, document=document, target=board, targets={}, views=tuple(views))
+        later = predict_stops(of_board, prior)
         assert {view.text["target"] for view in later.observed.session.views} == {name}
 
 
@@ -549,8 +549,8 @@ def test_a_joint_is_to_be_mastered_where_its_angle_is_proven_and_nothing_else_ch
     mastered = visioncal(*act).good().out
     assert f"Or master joint 3 on the controller, by the angle above: then {out} holds" in mastered
     assert "only where: The transforms belong to the calibrated arm" in mastered
-    both = visioncal(*act, "--cause", "joint 3", "--cause", "camera").good().out
-    assert "Or master" not in both
+    printed = visioncal(*act, "--cause", "joint 3", "--cause", "camera").good().out
+    assert "Or master" not in printed
     unproven = visioncal(*act, "--cause", "joint 2")
     assert unproven.status == 3
     assert "disagree" in unproven.out
@@ -608,11 +608,11 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     (stops / "views.csv").write_text("".join(rows[:10]))
     visioncal(*command).refused("9 of 15 stops")
     (stops / "views.csv").write_text("".join(rows))
-    asked = ("--targets", stops / "views.csv", "--to", "ur")
-    visioncal(*command, *asked).refused("--cause camera\n", "--cause mount\n")
+    options = ("--targets", stops / "views.csv", "--to", "ur")
+    visioncal(*command, *options).refused("--cause camera\n", "--cause mount\n")
     assert not (act / "result").exists()
     history = ("--history", tmp_path / "history.db")
-    done = visioncal(*command, *asked, "--cause", "camera", "--payload-kg", 3, *history).good()
+    done = visioncal(*command, *options, "--cause", "camera", "--payload-kg", 3, *history).good()
     # It is of the cell of the calibration from before, not one of its own.
     (entry,) = History(history[1]).entries()
     assert (entry.session, entry.cell) == ("moved", Calibration.load(out).session_name)

@@ -91,7 +91,7 @@ def test_steep_views_keep_their_corners():
         seen, ids = find_target(image, cell.options.target), checked.detectBoard(image)[1]
         ours.append(len(seen.ids) if isinstance(seen, DetectedCorners) else 0)
         opencvs.append(0 if ids is None else len(ids))
-    assert all(mine >= other for mine, other in zip(ours, opencvs, strict=True))
+    assert all(count >= other for count, other in zip(ours, opencvs, strict=True))
     # With its own check of the markers OpenCV drops the first of these boards altogether.
     assert opencvs[0] == 0
     assert ours[0] >= 20
@@ -580,9 +580,9 @@ def test_a_blob_that_continues_a_grid_of_circles_is_not_part_of_it(asymmetric):
     """A screw where the next circle would be."""
     board = circles(7, 6, asymmetric=asymmetric)
     places = kind_of(board).corners(board)[:, :2] / board.square_m * 36.0 + 70.0
-    beside = places[-1] + (places[1] - places[0])
+    blob = places[-1] + (places[1] - places[0])
     image = np.full((400, 640), 220, dtype=np.uint8)
-    for at in (*places, beside):
+    for at in (*places, blob):
         cv2.circle(image, np.rint(at).astype(int).tolist(), 9, 30, -1, cv2.LINE_AA)
     found = kind_of(board).search(image, board)
     assert found.px == pytest.approx(np.rint(places), abs=0.3)

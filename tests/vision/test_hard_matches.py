@@ -160,8 +160,8 @@ def test_no_matcher_is_imported_without_a_picture():
         "'visioncal.vision.dense'); "
         "print([name for name in sys.modules if name.startswith(heavy)])"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def flat_print(grey):

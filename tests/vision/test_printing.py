@@ -101,10 +101,10 @@ def test_shipped_pdfs_are_what_the_command_makes(name):
     shipped = (TARGETS / f"{name}.pdf").read_bytes()
     assert len(shipped) < 60_000
     made = printed(BOARDS[name], 100).astype(int)
-    there = raster(shipped, 100).astype(int)
-    assert there.shape == made.shape
+    shipped_raster = raster(shipped, 100).astype(int)
+    assert shipped_raster.shape == made.shape
     # Another version of the fonts' renderer may shade a letter's rim differently, nothing else.
-    assert np.abs(there - made).max() <= 8
+    assert np.abs(shipped_raster - made).max() <= 8
 
 
 @pytest.mark.parametrize("target", BOARDS.values(), ids=BOARDS)

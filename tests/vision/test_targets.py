@@ -156,9 +156,11 @@ def test_rotations_are_those_that_leave_the_printed_page_as_it_is(columns, rows)
     centres = np.stack([*np.mgrid[0 : columns + 1, 0 : rows + 1]], axis=-1).reshape(-1, 2) - 0.5
     for turn in rotation_transforms(target):
         moved = centres * target.square_m @ turn[:2, :2].T + turn[:2, 3]
-        there = np.rint(moved / target.square_m + 0.5).astype(int)
-        here = np.rint(centres + 0.5).astype(int)
-        assert np.array_equal(page[there[:, 1], there[:, 0]], page[here[:, 1], here[:, 0]])
+        turned_cells = np.rint(moved / target.square_m + 0.5).astype(int)
+        cells = np.rint(centres + 0.5).astype(int)
+        assert np.array_equal(
+            page[turned_cells[:, 1], turned_cells[:, 0]], page[cells[:, 1], cells[:, 0]]
+        )
         assert np.linalg.det(turn[:3, :3]) == pytest.approx(1.0)
     positions = corner_positions(target)
     pairs = list(zip(rotations(target), rotation_transforms(target), strict=True))

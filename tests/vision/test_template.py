@@ -203,14 +203,14 @@ def test_a_board_that_a_quick_search_misses_is_searched_thoroughly(target, monke
         DetectedCorners(seen.ids, seen.px + 15.0),
     )
     for part in parts:
-        asked = []
+        calls = []
 
-        def search(*args, quick=False, part=part, asked=asked):
-            return part if quick else (asked.append(1) or plain(*args))
+        def search(*args, quick=False, part=part, calls=calls):
+            return part if quick else (calls.append(1) or plain(*args))
 
         monkeypatch.setattr(kind, "search", search)
         found = find_target(image, target)
-        assert asked == [1]
+        assert calls == [1]
         assert found.ids.tolist() == seen.ids.tolist()
         assert rms(found.px - truth) < 0.02
 
@@ -324,14 +324,14 @@ def test_maps_follow_the_sides_of_tags_through_a_lens(camera, most_px, cut_px):
         whole = whole[(whole[:, 3] < len(places))]
         whole = whole[corners.ids[whole[:, 3]] == corners.ids[whole[:, 0]] + 3].ravel()
         # A tenth of a side further round, where the template looks.
-        beside = places[whole] + 0.1 * (
+        further = places[whole] + 0.1 * (
             places[np.roll(whole.reshape(-1, 4), -1, axis=1).ravel()] - places[whole]
         )
-        beside_px = project(camera, beside @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])
+        beside_px = project(camera, further @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])
         board, px = places[whole, :2] / SIDE_M, corners.px[whole]
         every = np.arange(len(px))
         on_board = maps_about(board, px, every >= 0, every, axis)[0]
-        off = on_board(beside_px[:, None])[:, 0] - (beside[:, :2] / SIDE_M - board)
+        off = on_board(beside_px[:, None])[:, 0] - (further[:, :2] / SIDE_M - board)
         scale = np.linalg.norm(np.diff(px[:2], axis=0)) / np.linalg.norm(np.diff(board[:2], axis=0))
         errors.append(scale * off)
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < most_px

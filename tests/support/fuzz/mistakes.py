@@ -47,13 +47,13 @@ def sound(robot: FloatArray, camera: FloatArray, mount: Mount, **more) -> Poses:
     return Poses(numbers(robot), numbers(camera), mount, robot, mount, **more)
 
 
-def _told(poses: Poses, rotation: str, unit: str, reading: Reading) -> Poses:
+def _misread(poses: Poses, rotation: str, unit: str, reading: Reading) -> Poses:
     return replace(poses, robot=numbers(poses.true_robot, rotation, unit).read_as(reading))
 
 
 def _unit(poses: Poses, rng: np.random.Generator) -> Poses:
     unit = ("mm", "cm", "inch")[rng.integers(3)]
-    return _told(poses, "quaternion-xyzw", unit, Reading())
+    return _misread(poses, "quaternion-xyzw", unit, Reading())
 
 
 def _inverse(poses: Poses, _: np.random.Generator) -> Poses:
@@ -63,29 +63,29 @@ def _inverse(poses: Poses, _: np.random.Generator) -> Poses:
 def _wxyz(poses: Poses, rng: np.random.Generator) -> Poses:
     """One order of a quaternion's numbers under the names of the other."""
     written = ("quaternion-wxyz", "quaternion-yzwx")[rng.integers(2)]
-    return _told(poses, written, "m", Reading())
+    return _misread(poses, written, "m", Reading())
 
 
 def _order(poses: Poses, rng: np.random.Generator) -> Poses:
     """Angles about Z, Y, X that are taken for X, Y, Z: as they stand, or made into quaternions."""
-    told = _told(poses, "euler-ZYX-deg", "m", Reading("euler-XYZ-deg"))
-    return told if rng.integers(2) else replace(told, robot=numbers(told.robot.poses()))
+    mistaken = _misread(poses, "euler-ZYX-deg", "m", Reading("euler-XYZ-deg"))
+    return mistaken if rng.integers(2) else replace(mistaken, robot=numbers(mistaken.robot.poses()))
 
 
 def _degrees(poses: Poses, rng: np.random.Generator) -> Poses:
     """Degrees taken for radians; or radians for degrees, which were made into quaternions."""
     if rng.integers(2):
-        return _told(poses, "euler-xyz-deg", "m", Reading("euler-xyz-rad"))
-    told = _told(poses, "euler-xyz-rad", "m", Reading("euler-xyz-deg"))
-    return replace(told, robot=numbers(told.robot.poses()))
+        return _misread(poses, "euler-xyz-deg", "m", Reading("euler-xyz-rad"))
+    mistaken = _misread(poses, "euler-xyz-rad", "m", Reading("euler-xyz-deg"))
+    return replace(mistaken, robot=numbers(mistaken.robot.poses()))
 
 
 def _wrapped(poses: Poses, rng: np.random.Generator) -> Poses:
     """Degrees taken for radians, or vectors for angles, that were made into quaternions."""
-    told = _told(poses, "rotation-vector-deg", "m", Reading("rotation-vector"))
+    mistaken = _misread(poses, "rotation-vector-deg", "m", Reading("rotation-vector"))
     if rng.integers(2):
-        told = _told(poses, "rotation-vector", "m", Reading("euler-xyz-rad"))
-    return replace(told, robot=numbers(told.robot.poses()))
+        mistaken = _misread(poses, "rotation-vector", "m", Reading("euler-xyz-rad"))
+    return replace(mistaken, robot=numbers(mistaken.robot.poses()))
 
 
 def _mount(poses: Poses, _: np.random.Generator) -> Poses:
@@ -96,16 +96,16 @@ def _shifted(poses: Poses, rng: np.random.Generator) -> Poses:
     """One robot pose too many at one end and one too few at the other."""
     by = (-1, 1)[rng.integers(2)]
     true = poses.true_robot.copy()
-    told = np.roll(true, by, axis=0)
+    reported = np.roll(true, by, axis=0)
     true[-1 if by > 0 else 0] = np.nan
-    return replace(poses, robot=numbers(told), true_robot=true)
+    return replace(poses, robot=numbers(reported), true_robot=true)
 
 
 def _swapped(poses: Poses, rng: np.random.Generator) -> Poses:
     first, second = rng.choice(len(poses.robot), 2, replace=False)
-    told = poses.true_robot.copy()
-    told[[first, second]] = told[[second, first]]
-    return replace(poses, robot=numbers(told))
+    reported = poses.true_robot.copy()
+    reported[[first, second]] = reported[[second, first]]
+    return replace(poses, robot=numbers(reported))
 
 
 def _reordered(poses: Poses, rng: np.random.Generator) -> Poses:
@@ -116,13 +116,13 @@ def _reordered(poses: Poses, rng: np.random.Generator) -> Poses:
     as_text = np.array(sorted(range(start, start + len(true)), key=str)) - start
     if way == 1:
         return replace(poses, robot=numbers(true[as_text]))
-    told = np.empty_like(true)
-    told[as_text] = true
-    return replace(poses, robot=numbers(told))
+    reported = np.empty_like(true)
+    reported[as_text] = true
+    return replace(poses, robot=numbers(reported))
 
 
 def _transposed(poses: Poses, _: np.random.Generator) -> Poses:
-    return _told(poses, "matrix-transposed", "m", Reading("matrix"))
+    return _misread(poses, "matrix-transposed", "m", Reading("matrix"))
 
 
 def _left_handed(poses: Poses, rng: np.random.Generator) -> Poses:
@@ -136,26 +136,26 @@ def _axes(poses: Poses, rng: np.random.Generator) -> Poses:
 
     In circular order, or with two other signs, they close the chain as such rotations do.
     """
-    told = numbers(poses.true_robot)
+    reported = numbers(poses.true_robot)
     order = ((0, 2, 1), (1, 0, 2), (2, 1, 0), (0, 1, 2))[rng.integers(4)]
     signs = np.ones(3)
     if order == (0, 1, 2):
         signs[rng.integers(3)] = -1.0
-    return replace(poses, robot=replace(told, positions=told.positions[:, order] * signs))
+    return replace(poses, robot=replace(reported, positions=reported.positions[:, order] * signs))
 
 
 def _components(poses: Poses, rng: np.random.Generator) -> Poses:
     """Two numbers of a rotation vector exchanged, one of other sign, or Euler angles in gon."""
     form = ("rotation-vector", "euler-ZYX-deg", "euler-XYZ-deg")[rng.integers(3)]
-    told, terms = numbers(poses.true_robot, form), np.eye(3)
+    reported, terms = numbers(poses.true_robot, form), np.eye(3)
     if form == "euler-ZYX-deg" and rng.integers(2):
         terms /= 0.9
     elif form == "rotation-vector" and rng.integers(2):
         terms = terms[:, ((0, 2, 1), (1, 0, 2), (2, 1, 0))[rng.integers(3)]]
     else:
         terms[(at := rng.integers(3)), at] = -1.0
-    told = replace(told, rotations=told.rotations @ terms)
-    return replace(poses, robot=told if rng.integers(2) else numbers(told.poses()))
+    reported = replace(reported, rotations=reported.rotations @ terms)
+    return replace(poses, robot=reported if rng.integers(2) else numbers(reported.poses()))
 
 
 def _board_mm(poses: Poses, _: np.random.Generator) -> Poses:

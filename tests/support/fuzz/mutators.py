@@ -264,8 +264,8 @@ def mutate(input_: Path, chance: Chance, others: Sequence[Path]) -> str:
     ends = {file: file.suffix.lower() if file.suffix.lower() in KINDS else "" for file in files}
     kind = chance.choice(sorted(set(ends.values())))
     path = chance.choice([file for file in files if ends[file] == kind])
-    own, common = KINDS[kind]
-    mutator = chance.choice(own if chance.random() < _BY_KIND else common)
+    of_kind, common = KINDS[kind]
+    mutator = chance.choice(of_kind if chance.random() < _BY_KIND else common)
     path.write_bytes(mutator(path.read_bytes() or b"0", chance))
     return f"{mutator.__name__}: {path.relative_to(input_.parent)}"
 

@@ -54,20 +54,20 @@ def write_stops(path: Path, folder: Path) -> None:
 def write_requests(path: Path, _: Path) -> None:
     """What a browser asks of a page, in whole requests."""
     head = "HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nConnection: close\r\n"
-    own = "Origin: http://127.0.0.1:PORT\r\n"
+    origin = "Origin: http://127.0.0.1:PORT\r\n"
     said = '42["handshake",{"client_id":"1","tab_id":"2","next_message_id":0}]'
-    asked = [
+    requests = [
         f"GET / {head}\r\n",
         f"GET /live.jpg {head}Accept: image/jpeg\r\n\r\n",
         f"GET /report {head}Cookie: a=b\r\nRange: bytes=0-9\r\n\r\n",
         f"GET /_nicegui/3/static/nicegui.css {head}If-None-Match: \"x\"\r\n\r\n",
-        f"GET {_SOCKET_IO} {head}{own}\r\n",
-        f"POST {_SOCKET_IO}&sid=1 {head}{own}Content-Length: {len(said)}\r\n\r\n{said}",
+        f"GET {_SOCKET_IO} {head}{origin}\r\n",
+        f"POST {_SOCKET_IO}&sid=1 {head}{origin}Content-Length: {len(said)}\r\n\r\n{said}",
         f"GET {_SOCKET_IO.replace('polling', 'websocket')} HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\n"
-        f"{own}Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"{origin}Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n",
     ]  # fmt: skip
-    path.write_bytes(BETWEEN.join(each.encode() for each in asked))
+    path.write_bytes(BETWEEN.join(each.encode() for each in requests))
 
 
 def write_checks(path: Path, _: Path) -> None:
@@ -138,10 +138,12 @@ def served(words: Sequence[str], requests: bytes, port: int) -> tuple[Done, list
     It has to answer a sound request at the end, and is ended by Ctrl-C.
     """
     # NiceGUI would take the process for a test of itself.
-    own = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
+    }
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", "visioncal", *words],
-        env=own,
+        env=environment,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -159,11 +159,11 @@ def _board(rng: np.random.Generator, camera: Camera) -> Target:
     return BOARDS[kind]
 
 
-def write(item: Cell, beside: Path, visit: int = 0) -> Path:
+def write(item: Cell, parent: Path, visit: int = 0) -> Path:
     """Writes a visit to a cell as a session: the first is to be calibrated, others verify."""
     rng = np.random.default_rng([item.seed, 11, visit])
     odd = _chance(rng, 0.4)
-    folder = beside / (str(rng.choice(FOLDERS)) if odd else "session")
+    folder = parent / (str(rng.choice(FOLDERS)) if odd else "session")
     views = 6 if visit else item.options.views
     sim = simulate(replace(item.options, recording=visit, views=views, wrong_views=0 if visit else
                            item.options.wrong_views))  # fmt: skip
@@ -239,24 +239,24 @@ class Walk:
     sigmas: float = 0.0
 
 
-def walk(seed: int, beside: Path) -> Walk:
+def walk(seed: int, parent: Path) -> Walk:
     """Draws a cell and runs commands through it, in an empty folder; some by the seed's chance."""
-    done, drawn, out = Walk(), cell(seed), beside / "out ü"
+    done, drawn, out = Walk(), cell(seed), parent / "out ü"
     for name in ("first", "second"):
-        (beside / name).mkdir()
-    session, rng = write(drawn, beside / "first"), np.random.default_rng([seed, 3])
+        (parent / name).mkdir()
+    session, rng = write(drawn, parent / "first"), np.random.default_rng([seed, 3])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if _run(done, "calibrate", session, "-o", out, *(["-v"] if seed % 2 else [])):
             _look_at(done, drawn, out)
-            _use(done, drawn, rng, session, out, beside)
+            _use(done, drawn, rng, session, out, parent)
         if rng.random() < 0.3:
-            there = _run(done, "convert", session, beside / "it.rrd")
-            back = there and _run(done, "convert", beside / "it.rrd", beside / "again")
+            forth = _run(done, "convert", session, parent / "it.rrd")
+            back = forth and _run(done, "convert", parent / "it.rrd", parent / "again")
             if (
-                there
+                forth
                 and back
-                and len({one.partition("sha256 ")[2][:64] for one in (there, back)}) > 1
+                and len({one.partition("sha256 ")[2][:64] for one in (forth, back)}) > 1
             ):
                 done.wrong.append("convert: another digest")
     done.warned = {f"{Path(one.filename).name}:{one.lineno} {one.message}" for one in caught}
@@ -264,10 +264,10 @@ def walk(seed: int, beside: Path) -> Walk:
 
 
 def _use(done: Walk, item: Cell, rng: np.random.Generator, session: Path, out: Path,
-         beside: Path) -> None:  # fmt: skip
+         parent: Path) -> None:  # fmt: skip
     """All that is done with a result."""
-    if rng.random() < 0.2 and _run(done, "show", out, "-o", beside / "again.html"):
-        Page((beside / "again.html").read_text("utf-8"))
+    if rng.random() < 0.2 and _run(done, "show", out, "-o", parent / "again.html"):
+        Page((parent / "again.html").read_text("utf-8"))
     recording = find_recording(out)
     with _noted(done, "show --viewer"):
         blueprint(Session.load(recording), load_calibration(recording))
@@ -275,13 +275,13 @@ def _use(done: Walk, item: Cell, rng: np.random.Generator, session: Path, out: P
     formats += [rng.choice(LENSES)] * (item.seen == "images")
     formats += [rng.choice(ARMS)] * (item.rows != "poses")
     for at, name in enumerate(formats):
-        _run(done, "export", out, "--to", name, "--force", "-o", beside / f"export {at}")
+        _run(done, "export", out, "--to", name, "--force", "-o", parent / f"export {at}")
     if rng.random() < 0.25:
-        fresh = write(item, beside / "second", visit=1)
-        _run(done, "verify", fresh, "--against", out, "-o", beside / "check")
+        fresh = write(item, parent / "second", visit=1)
+        _run(done, "verify", fresh, "--against", out, "-o", parent / "check")
         _run(done, "locate", fresh, "-c", out, "--force")
     if rng.random() < 0.2:
-        _run(done, "plan", session, "--add", 3, "-o", beside / "plan", "--candidates", 200)
+        _run(done, "plan", session, "--add", 3, "-o", parent / "plan", "--candidates", 200)
 
 
 @contextmanager
