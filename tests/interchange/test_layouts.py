@@ -1641,6 +1641,33 @@ def test_poses_of_the_board_are_not_taken_for_the_robot_s(tmp_path):
     np.testing.assert_allclose(found, poses, atol=1e-9)
 
 
+def test_results_of_another_program_are_not_taken_for_its_records(tmp_path):
+    """Tables of errors name the same pictures, and drawn ones; a log and a result have few rows."""
+    poses, pictures, session = world()
+    folder = tmp_path / "in"
+    for name in ("images", "overlays", "tries", "records"):
+        (folder / name).mkdir(parents=True)
+    for at, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
+        cv2.imwrite(str(folder / f"images/img_{at:03d}.png"), picture)
+        cv2.imwrite(str(folder / f"overlays/record_{at:03d}_axes.png"), picture)
+        record = {"image": f"img_{at:03d}.png", "gripper_pose": pose.tolist()}
+        write(folder / f"records/record_{at:03d}.json", record)
+    names = [(f"img_{at:03d}.png", f"record_{at:03d}_axes.png") for at in range(len(poses))]
+    rows = [f"{image},{drawn},{at}" for at, (image, drawn) in enumerate(names)]
+    write(folder / "overlays/summary.csv", "\n".join(["image,overlay,err_mm", *rows]))
+    for at in range(3):
+        cv2.imwrite(str(folder / f"tries/try_{at}.png"), pictures[0])
+    tries = [f"try_{at}.png,{at}" for at in range(3)]
+    write(folder / "tries/log.csv", "\n".join(["img,z_m", *tries]))
+    np.savez(folder / "result.npz", R_cam2base=np.eye(3), t_cam2base=np.ones(3))
+    said = ("--target", session.document["target"], "--mount", "eye-in-hand")
+    visioncal("convert", folder, tmp_path / "out", *said).good()
+    views = Session.load(tmp_path / "out").views
+    found = [view.base_from_flange().as_matrix() for view in views]
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+    assert [Path(view.image).name for view in views] == [image for image, _ in names]
+
+
 def test_angles_of_two_runs_are_no_sides(tmp_path):
     """By the files' name they are joints, or by their numbers those of one motion."""
     (tmp_path / "in").mkdir()

@@ -19,7 +19,13 @@ from visioncal.interchange.formats.fields import (
     unit_by_size,
     without_unit,
 )
-from visioncal.interchange.formats.file_search import FileGroup, groups_in, image_groups, images_of
+from visioncal.interchange.formats.file_search import (
+    DRAWN,
+    FileGroup,
+    groups_in,
+    image_groups,
+    images_of,
+)
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
@@ -42,6 +48,7 @@ from visioncal.interchange.formats.pose_forms import makers_of, poses_from
 from visioncal.interchange.formats.poses import columns_named, pose_names, possible_poses
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import (
+    ASIDE,
     Source,
     describe,
     proposed,
@@ -82,7 +89,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     lens, notes = (None, ()) if requested.intrinsics else source.lens()
     board = (None, ()) if requested.target else source.board()
     found: list[tuple[int, ForeignRecording]] = []
-    faults: list[DataError] = []
+    faults: list[tuple[int, DataError]] = []
     readings = _proposed(source, requested)
     instead = image_groups(requested.images) if requested.images else None
     for rank, fields, options in readings:
@@ -97,9 +104,10 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
                 found.append((rank + more, whole))
         except DataError as error:
-            faults.append(error)
-    if not found:
-        raise faults[0]
+            faults.append((rank, error))
+    # What is wrong with a recording is said, and no result beside it taken instead.
+    if not found or (faults and faults[0][0] + ASIDE <= min(at for at, _ in found)):
+        raise faults[0][1]
     (rank, first), *others = sorted(of_most_images(found), key=lambda each: each[0])
     first = replace(first, notes=(*small_part(first, source, instead), *first.notes))
     is_clear = not others or others[0][0] > rank
@@ -393,8 +401,11 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
         for name, cells in free.items()
         if any(cells) and all(not cell or is_image_name(cell) or cell in named for cell in cells)
     }
-    if any(any(found) for found in naming.values()):
-        naming = {name: found for name, found in naming.items() if any(found)}
+    if most := max((len(found) - found.count(None) for found in naming.values()), default=0):
+        # Others name pictures of some rows alone, or that another program drew.
+        naming = {n: found for n, found in naming.items() if len(found) - found.count(None) == most}
+        seen = {n: found for n, found in naming.items() if not any(map(_is_drawn, found))}
+        naming = seen or naming
     # Several columns may name the same images.
     if len({*naming.values()}) > 1:
         raise DataError(
@@ -403,6 +414,10 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
             next_step=f"Say which with --image-{named_by(fields.places[0]).rstrip('s')}.",
         )
     return max(naming, key=lambda name: is_image_name(free[name][0]), default="")
+
+
+def _is_drawn(file: Path | None) -> bool:
+    return file is not None and DRAWN.search(f"{file.parent.name}/{file.name}") is not None
 
 
 VIEWS = ForeignFormat(

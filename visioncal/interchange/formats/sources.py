@@ -63,6 +63,8 @@ _SHUT = dict.fromkeys((".pkl", ".pickle", ".p"), _PICKLE) | dict.fromkeys(
 )
 # Lines of a camera_info's matrix and coefficients.
 _CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
+# Rank of rows that are no recording beside others.
+ASIDE = 8
 # Readings of one source that are tested, and names of rows that are a robot's.
 _MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
 
@@ -278,9 +280,9 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
         # A result of another program has a row or two.
-        later += 8 * (len(fields) < FEWEST_ROWS)
+        later += ASIDE * (len(fields) < FEWEST_ROWS)
         # A list of a few poses beside many of the robot's is of checks.
-        later += 8 * (2 * len(fields) < max(of_robot, default=0))
+        later += ASIDE * (2 * len(fields) < max(of_robot, default=0))
         options = _with_joints(fields, requested)
         joints = options.joints or joint_names(fields, ())
         is_given = bool(requested.robot.names) or not _has(fields, given)
