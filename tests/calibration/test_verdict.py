@@ -738,6 +738,16 @@ def test_poses_of_the_camera_in_place_of_the_robots_are_named(mount: str) -> Non
     assert (verdict.status, ids(verdict)[:1]) == ("bad", ["camera_poses"])
 
 
+def test_a_row_of_zeros_is_left_out_by_name() -> None:
+    """A program that waits for its first target writes them for both sides."""
+    cell = simulate(CellOptions(views=14))
+    poses, seen = cell.robot.base_from_flange.copy(), cell.cam_from_target.copy()
+    poses[9], seen[9] = np.eye(4), np.eye(4)
+    found = calibrate(pairs_session(MOUNTS[0], poses, seen))
+    assert "measured position of the target is zero" in found.views[9].reason
+    assert [view.view for view in found.views if not view.used] == [9]
+
+
 def test_a_camera_behind_its_flange_where_no_bracket_has_it_is_a_doubt() -> None:
     cell, tool = simulate(CellOptions(views=14)), np.eye(4)
     tool[2, 3] = 0.17

@@ -291,6 +291,9 @@ def _by_motion(seen: Observed, frame: str, error: VisioncalError) -> CameraResul
     )
 
 
+_OF_ZEROS = "its measured position of the target is zero, as where nothing was seen"
+
+
 def locate_targets(seen: T) -> T:
     """Estimates the target's pose in each view, or takes it from the session where given.
 
@@ -301,8 +304,12 @@ def locate_targets(seen: T) -> T:
             corners.
     """
     session, targets = seen.session, tuple(seen.session.boards.values())
-    stated = stated_poses(session).items()
-    poses = {**seen.poses, **{view: pose for view, pose in stated if view not in seen.repeats}}
+    stated = stated_poses(session)
+    # What a program writes where it saw nothing: no target is at the camera's own origin.
+    zeros = [view for view, at in stated.items() if not at.cam_from_target[0, :3, 3].any()]
+    seen = seen.noting(Rejection(view, _OF_ZEROS) for view in zeros)
+    given = {view: at for view, at in stated.items() if view not in {*seen.repeats, *zeros}}
+    poses = {**seen.poses, **given}
     for frame, look in seen.cameras.items():
         corners = {view: px for view, px in look.corners.items() if view not in seen.reasons}
         fitted = {view: px for view, px in corners.items() if view not in seen.held_back}
