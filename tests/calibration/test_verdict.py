@@ -287,6 +287,10 @@ def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
     sure = replace(found[2], probability=0.6)
     assert Verdict("bad", (found[4], sure)).top[1] == "Also likely (60 %): The lens is another."
     assert verdict.next_steps == (EXCHANGED.do, Remedy("Add views."), Remedy("Leave it out."))
+    # A cure that was tried precedes what is as certain by a limit alone.
+    field = Finding("lens", "The lens is odd.", probability=1.0, by_limit=True)
+    size = Finding("board_size", "The board is larger.", probability=1.0 - 1e-9)
+    assert in_reading_order((field, size), "bad") == (size, field)
     assert Verdict.of("good", "Fine.").top == ("Fine.",)
 
 
