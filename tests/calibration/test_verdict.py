@@ -742,6 +742,18 @@ def test_poses_of_the_camera_in_place_of_the_robots_are_named(mount: str) -> Non
     assert (verdict.status, ids(verdict)[:1]) == ("bad", ["camera_poses"])
 
 
+def test_readings_turned_about_their_own_origin_are_no_other_tool() -> None:
+    """A tracker that takes markers for others turns its body by half a turn, in three views."""
+    cell = simulate(CellOptions(views=16, mount="eye-to-hand"))
+    seen = cell.cam_from_target.copy()
+    seen[[0, 1, 9]] = seen[[0, 1, 9]] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    verdict = calibrate(pairs_session("eye-to-hand", cell.robot.base_from_flange, seen)).verdict
+    cause = verdict.causes[0]
+    assert (cause.kind, cause.views) == ("something_moved", (0, 1, 9))
+    assert "the target was another one: turned by 180 deg in its own place" in cause.words
+    assert "without-tool" not in cause.do.command
+
+
 def test_a_row_of_zeros_is_left_out_by_name() -> None:
     """A program that waits for its first target writes them for both sides."""
     cell = simulate(CellOptions(views=14))

@@ -305,7 +305,7 @@ def locate_targets(seen: T) -> T:
     """
     session, targets = seen.session, tuple(seen.session.boards.values())
     stated = stated_poses(session)
-    # What a program writes where it saw nothing: no target is at the camera's own origin.
+    # Programs write zeros where they saw nothing: no target is at the camera's own origin.
     zeros = [view for view, at in stated.items() if not at.cam_from_target[0, :3, 3].any()]
     seen = seen.noting(Rejection(view, _OF_ZEROS) for view in zeros)
     given = {view: at for view, at in stated.items() if view not in {*seen.repeats, *zeros}}

@@ -247,10 +247,16 @@ def _tool_taken_off(
 ) -> Remedy | None:
     """Advice by a change that some views have in common; see `tool_taken_off`."""
     frame, step = change
-    if not frame:
+    if not frame or _is_turned_in_place(frame, step):
         return None
     edge = cell_fit.fit.frames[frame]
     return tool_taken_off(cell_fit, frame, (edge, edge @ step), views, otherwise)
+
+
+def _is_turned_in_place(frame: str, step: FloatArray) -> bool:
+    """Whether a target turned about its own origin, which no tool has there by chance."""
+    mm, deg = pose_difference(np.eye(4), step)
+    return not frame.startswith("cam") and mm < _ARM_ERRS[0] and deg > KNOCKED[1]
 
 
 def tool_taken_off(
@@ -319,6 +325,9 @@ def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str
         thing = "probe" if on_flange else "instrument"
     of_robot = f"controller's {'tool' if on_flange else 'base frame'}"
     mm, deg = pose_difference(np.eye(4), step)
+    if _is_turned_in_place(frame, step):
+        how = f": turned by {figure(deg)} deg in its own place, as a tracker reads a body "
+        return f"the {thing}", f"{how}of which it takes markers for others"
     moved = mm_and_deg(mm, deg) if deg else f"{figure(mm)} mm"
     how = f": the {thing} by {moved}, or the {of_robot} by {other_frame(edge, edge @ step)}"
     return f"the {thing} or the {of_robot}", how

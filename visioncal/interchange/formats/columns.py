@@ -105,7 +105,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
                 found.append((rank + more, whole))
         except DataError as error:
             faults.append((rank, error))
-    # What is wrong with a recording is said, and no result beside it taken instead.
+    # A recording's fault is said, and no result beside it taken instead.
     if not found or (faults and faults[0][0] + ASIDE <= min(at for at, _ in found)):
         raise faults[0][1]
     (rank, first), *others = sorted(of_most_images(found), key=lambda each: each[0])
