@@ -266,6 +266,40 @@ def test_points_whose_order_their_distances_do_not_show_are_refused(tmp_path):
     assert "Add a column `stop`" in said
 
 
+def test_points_of_another_arm_beside_an_arm_s_are_left_aside(tmp_path):
+    """Points of as many rows as the joint angles are theirs, whatever file stands first."""
+    joints, places = tracked(tmp_path / "in", 1)
+    np.savetxt(tmp_path / "in/Q_six.txt", joints)
+    np.savetxt(tmp_path / "in/P_six.txt", places[:, 0])
+    np.savetxt(tmp_path / "in/P_3R.txt", places[:7, 0] + 100.0)
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *TRACKED).good()
+    assert "Left aside: P_3R.txt (7 rows)" in done.err
+    found = [view.numbers["meas_x_m"] for view in Session.load(tmp_path / "out").views]
+    np.testing.assert_allclose(found, 1e-3 * places[:, 0, 0])
+
+
+def test_poses_of_the_target_alone_are_not_proposed_as_the_robot_s(tmp_path):
+    poses = matrices(11)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec().tolist()
+    seen = {"board_to_camera_tvecs": poses[:, :3, 3].tolist(), "board_to_camera_rvecs": turns}
+    write(tmp_path / "in/out_camera_data.json", {"extrinsic_parameters": seen})
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    assert "Put the robot's poses beside them" in done.refused("are the target's").err
+    assert "--robot-key extrinsic" not in done.err
+
+
+def test_numbered_thetas_are_joint_angles_beside_the_measured_pose(tmp_path):
+    rng, poses = np.random.default_rng(2), matrices(14)
+    names = [f"theta_{at}" for at in range(1, 7)] + [
+        f"m_{r}{c}" for r in range(4) for c in range(4)
+    ]
+    rows = np.hstack([rng.uniform(-1.5, 1.5, (14, 6)), poses.reshape(-1, 16)])
+    cells = [",".join(map(repr, row)) for row in rows.tolist()]
+    write(tmp_path / "in/run.csv", "\n".join([",".join(names), *cells]))
+    done = visioncal("convert", tmp_path / "in/run.csv", tmp_path / "out", "--mount", "eye-to-hand")
+    done.refused("there are joint angles and no poses of the robot", "--robot-model")
+
+
 def test_positions_and_rotations_in_a_file_each_are_poses(tmp_path):
     poses, other = matrices(12, 1), matrices(12, 2)
     (tmp_path / "in").mkdir()

@@ -15,7 +15,7 @@ _JOINTS = re.compile(
     r"(?:.*[._])?(?:joint_pose|joints?|joint_angles|joint_(?:positions?|values?|states?)|q)"
 )
 _JOINT_NAME = re.compile(
-    r"(?:.*\.)?((?:[^.]*_)?(?:joint|axis|gelenk|achse)|(?:actual_)?q|j|a)[ _]?([0-9])"
+    r"(?:.*\.)?((?:[^.]*_)?(?:joint|axis|gelenk|achse)|(?:actual_)?q|j|a|theta|θ)[ _]?([0-9])"
     r"((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )

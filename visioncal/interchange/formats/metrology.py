@@ -88,6 +88,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     states = states or [*(t for t in tables if t.poses), *split]
     parts = parts_of_poses(every) if split else set[str]()
     points_only = [t for t in of_points if t not in states and t.fields.name not in parts]
+    # Points of another arm beside these have other rows.
+    points_only.sort(key=lambda points: len(points.fields) not in {len(t.fields) for t in states})
     points = next(
         iter(points_only or sorted(of_points, key=lambda table: not table.is_measured)), None
     )

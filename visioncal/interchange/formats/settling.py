@@ -375,10 +375,6 @@ def _untested(
             "measured side (as checkerboard_9x6_25mm, or circles_4x11_20mm_asymmetric of "
             "staggered rows 20 mm apart), or by its .toml.",
         )
-    # Other images make no difference where the stored poses of the target are used.
-    is_stored = foreign.camera is not None and foreign.target is None
-    if foreign.doubt and not (is_stored and isinstance(foreign.doubt, UnpairedError)):
-        raise foreign.doubt
     is_armless = foreign.arm is None and foreign.robot_document is None
     is_armless &= foreign.joints_rad is not None and not foreign.robot.present.any()
     if needs_form and is_armless:
@@ -388,6 +384,10 @@ def _untested(
             culprits=["--robot-model"],
             next_step="Name the arm with --robot-model: a built-in robot, its .urdf or a DH table.",
         )
+    # Other images make no difference where the stored poses of the target are used.
+    is_stored = foreign.camera is not None and foreign.target is None
+    if foreign.doubt and not (is_stored and isinstance(foreign.doubt, UnpairedError)):
+        raise foreign.doubt
     for side, free in foreign.unstated.items():
         if "rotation" in free:
             raise _unsaid(foreign, side, why, fault)

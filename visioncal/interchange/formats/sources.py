@@ -404,7 +404,10 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         for side, item in zip(("robot", "camera"), (robot, *others[:1]), strict=False):
             options += [f"--{side}-{named_by(fields.places[0])}", ",".join(item.names)]
         step = _of_one_file(source, requested, robot.names)
-        if not step and uneven and not (others or source.images):
+        if robot.is_of_target and not others:
+            step = f"By their names, {','.join(robot.names)} are the target's. Put the robot's "
+            step += "poses beside them, a row each, or name them with --robot-key."
+        elif not step and uneven and not (others or source.images):
             counts = [
                 f"{','.join(item.names)} ({_filled(fields, item, lengths)})" for item in uneven
             ]
