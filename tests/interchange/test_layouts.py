@@ -1641,6 +1641,22 @@ def test_poses_of_the_board_are_not_taken_for_the_robot_s(tmp_path):
     np.testing.assert_allclose(found, poses, atol=1e-9)
 
 
+def test_angles_that_turn_clockwise_are_read_by_the_printed_option(tmp_path):
+    """Of all angles negated the rotations are transposed, which no form of poses says."""
+    poses, _, session = world()
+    shoot(tmp_path / "in", "{}.jpg")
+    turns = -Rotation.from_matrix(poses[:, :3, :3]).as_euler("XYZ", degrees=True)
+    rows = np.hstack([1e3 * poses[:, :3, 3], turns])
+    write_table(tmp_path / "in/poses.csv", ("x", "y", "z", "rx", "ry", "rz"), rows)
+    said = ("--target", session.document["target"], "--mount", "eye-in-hand")
+    asked = visioncal("convert", tmp_path / "in", tmp_path / "out", *said)
+    assert "Convert with --guess --yes" in asked.refused("rotations transposed").err
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said, "--guess", "--yes")
+    done.good()
+    found = [view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "out").views]
+    np.testing.assert_allclose(found, poses, atol=1e-6)
+
+
 def test_results_of_another_program_are_not_taken_for_its_records(tmp_path):
     """Tables of errors name the same pictures, and drawn ones; a log and a result have few rows."""
     poses, pictures, session = world()

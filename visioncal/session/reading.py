@@ -35,7 +35,7 @@ def session_text(path: Path) -> str:
         found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
         if not path.exists():
             siblings = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
-            found += [siblings[name] for name in get_close_matches(path.name, siblings, 1)]
+            found += [siblings[name] for name in get_close_matches(path.name, siblings, 1, 0.8)]
         near = next((file.parent for file in found if file.is_file()), None)
         if near is None and not (path.exists() and error.message.endswith("does not exist.")):
             raise

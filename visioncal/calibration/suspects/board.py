@@ -225,8 +225,8 @@ def _shape_findings(
     flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."
     if len(points) and has_moved(*points):
         words = f"The {called} has {_elsewhere(corner_positions(target), corners)}."
-        do = f"Measure it there. {flat}"
-        yield Finding("board_shape", f"{words} The result counts it.", Remedy(do))
+        do = Remedy(f"Measure the print there with a caliper. {flat}")
+        yield Finding("board_shape", f"{words} The result counts it.", do)
         return
     parts = []
     if has_moved(*stretch):

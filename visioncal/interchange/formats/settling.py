@@ -414,17 +414,14 @@ def _unsaid(
     by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
     if side == "robot" and len(by_names) == 1:
         forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
-    if why.startswith("With "):
-        joints += (
-            " What else this reading changes is done to the session that is then written: "
-            "visioncal convert SESSION NEW --guess --yes."
-        )
     unsaid = f"the form of the {side}'s rotations is not stated"
     # A fault of the images comes first: while it lasts, no form helps.
     words = f"{unsaid}, and nothing determines it: {why}"
     step = f"{_MOVE}say" if why.startswith((ONE_AXIS, _STILL)) else "Say"
     if why.startswith(_STILL):
         words = f"{why}. No calibration is determined so, and no form of these rotations"
+    elif why.startswith("With "):
+        words, step = f"{unsaid}. {why}", "Convert with --guess --yes to read them so. Else say"
     elif why.startswith(NO_READING):
         step = "Look whether these rows are those of these images or poses of the target. Else give"
         if foreign.images and foreign.target is None:
