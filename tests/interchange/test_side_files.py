@@ -94,6 +94,17 @@ def test_joint_angles_of_all_pictures_come_before_frames_of_a_few(tmp_path, writ
     assert "the matrix is scaled by 0.6667" in done.err
 
 
+def test_a_lens_of_matlab_has_the_rows_of_its_pictures_first(tmp_path):
+    shoot(tmp_path / "in", "{:02}.png", 6)
+    for at, pose in enumerate(matrices(6), 1):
+        write(tmp_path / f"in/{at:02}.json", {"base_from_flange": pose.tolist()})
+    lens = {"K": [[100.0, 0, 62.0], [0, 101.0, 36.0], [0, 0, 1]], "image_size": [72, 128]}
+    savemat(tmp_path / "in/camera_params.mat", lens | {"radial_distortion": [-0.25, 0.125]})
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *BOARD).good()
+    camera = Session.load(tmp_path / "out").camera
+    assert (tuple(camera.resolution), camera.matrix[0]) == ((128, 72), 100.0)
+
+
 def test_a_reading_of_a_small_part_of_the_pictures_says_so(tmp_path):
     shoot(tmp_path / "in", "{:02}.png", 12)
     poses = matrices(5)

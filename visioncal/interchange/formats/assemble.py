@@ -434,11 +434,14 @@ def _of_size(
     if len(sizes) != 1 or stated in sizes or not stated:
         return lens
     size = next(filter(None, sizes))
+    fx, fy, cx, cy = (float(value) for value in lens["matrix"])
+    if stated == size[::-1] and abs(2.0 * cx - size[0]) < abs(2.0 * cx - stated[0]):
+        # MATLAB's `ImageSize` has the rows first.
+        return lens | {"resolution": list(size)}
     share = np.array(size) / np.array(stated)
     # A side may be rounded to whole pixels.
     if abs(share[0] * stated[1] - size[1]) > 1.0:
         return lens
-    fx, fy, cx, cy = (float(value) for value in lens["matrix"])
     scaled = [fx * share[0], fy * share[1], *((np.array([cx, cy]) + 0.5) * share - 0.5)]
     notes.append(
         f"The intrinsics are of images of {stated[0]} x {stated[1]} pixels, and these have "
