@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -19,13 +19,7 @@ from visioncal.interchange.formats.fields import (
     unit_by_size,
     without_unit,
 )
-from visioncal.interchange.formats.file_search import (
-    DRAWN,
-    FileGroup,
-    groups_in,
-    image_groups,
-    images_of,
-)
+from visioncal.interchange.formats.file_search import FileGroup, groups_in, image_groups, images_of
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
@@ -36,10 +30,11 @@ from visioncal.interchange.formats.foreign import (
     Unstated,
 )
 from visioncal.interchange.formats.joints import joint_names, joints_from
-from visioncal.interchange.formats.keys import in_seconds, is_image_name
+from visioncal.interchange.formats.keys import in_seconds
 from visioncal.interchange.formats.pairing import (
     Pairing,
     UnpairedError,
+    image_column,
     images_named,
     paired,
     with_depth,
@@ -70,7 +65,6 @@ from visioncal.session.columns import INSTRUMENT_POSITION
 
 # Most joints of a gripper that stand behind the arm's in one list.
 _FINGERS = 2
-_IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 
 
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
@@ -361,7 +355,7 @@ def _images(
     column = requested.image
     every = found if given is None else given
     groups = [group for group in every if group.is_images]
-    name = fields.find(column) if column else _image_name(fields, groups, taken)
+    name = fields.find(column) if column else image_column(fields, groups, taken)
     if name in fields.texts:
         cells = _with_folders(fields, name, groups)
         named = None if given is None else groups
@@ -385,39 +379,6 @@ def _with_folders(fields: Fields, name: str, groups: Sequence[FileGroup]) -> tup
     folders = {file.parent.name for group in groups for file in group.files}
     named = next((each for each in fields.texts.values() if {*each} <= folders), None)
     return tuple(map("{}/{}".format, named, cells)) if named else cells
-
-
-def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[str]) -> str:
-    """Finds the field that names images, by its name or its cells; empty where none does."""
-    free = {name: cells for name, cells in fields.texts.items() if name not in taken}
-    usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
-    if name := next(usual, ""):
-        return name
-    pictures = [group for group in groups if not group.is_depth] or groups
-    files = [file for group in pictures for file in group.files]
-    named = {file.stem: file for file in files} | {file.name: file for file in files}
-    naming = {
-        name: tuple(named.get(PureWindowsPath(cell).name) for cell in cells)
-        for name, cells in free.items()
-        if any(cells) and all(not cell or is_image_name(cell) or cell in named for cell in cells)
-    }
-    if most := max((len(found) - found.count(None) for found in naming.values()), default=0):
-        # Others name pictures of some rows alone, or that another program drew.
-        naming = {n: found for n, found in naming.items() if len(found) - found.count(None) == most}
-        seen = {n: found for n, found in naming.items() if not any(map(_is_drawn, found))}
-        naming = seen or naming
-    # Several columns may name the same images.
-    if len({*naming.values()}) > 1:
-        raise DataError(
-            f"{fields.name}: {some_of([*naming])} all name images: one of them must be chosen.",
-            culprits=[*naming],
-            next_step=f"Say which with --image-{named_by(fields.places[0]).rstrip('s')}.",
-        )
-    return max(naming, key=lambda name: is_image_name(free[name][0]), default="")
-
-
-def _is_drawn(file: Path | None) -> bool:
-    return file is not None and DRAWN.search(f"{file.parent.name}/{file.name}") is not None
 
 
 VIEWS = ForeignFormat(

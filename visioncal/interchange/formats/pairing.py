@@ -2,11 +2,11 @@
 
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from os.path import commonpath
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from visioncal.interchange.formats.keys import HOW, Match, is_image_name, matche
 
 # Fewest rows of which the motion may say which one has no image.
 _FEWEST_PAIRED = 8
-# Cells of rows without an image.
+# Names of columns that name images, and cells of rows without one.
+_IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 _NO_IMAGE = ("", "n/a", "none", "null", "nan")
 
 
@@ -69,6 +70,39 @@ def images_named(
             )
         paths.append(path)
     return tuple(paths)
+
+
+def image_column(fields: Fields, groups: Sequence[FileGroup], taken: Collection[str]) -> str:
+    """Finds the field that names images, by its name or its cells; empty where none does."""
+    free = {name: cells for name, cells in fields.texts.items() if name not in taken}
+    usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
+    if name := next(usual, ""):
+        return name
+    pictures = [group for group in groups if not group.is_depth] or groups
+    files = [file for group in pictures for file in group.files]
+    named = {file.stem: file for file in files} | {file.name: file for file in files}
+    naming = {
+        name: tuple(named.get(PureWindowsPath(cell).name) for cell in cells)
+        for name, cells in free.items()
+        if any(cells) and all(not cell or is_image_name(cell) or cell in named for cell in cells)
+    }
+    if most := max((len(found) - found.count(None) for found in naming.values()), default=0):
+        # Others name pictures of some rows alone, or that another program drew.
+        naming = {n: found for n, found in naming.items() if len(found) - found.count(None) == most}
+        seen = {n: found for n, found in naming.items() if not any(map(_is_drawn, found))}
+        naming = seen or naming
+    # Several columns may name the same images.
+    if len({*naming.values()}) > 1:
+        raise DataError(
+            f"{fields.name}: {some_of([*naming])} all name images: one of them must be chosen.",
+            culprits=[*naming],
+            next_step=f"Say which with --image-{named_by(fields.places[0]).rstrip('s')}.",
+        )
+    return max(naming, key=lambda name: is_image_name(free[name][0]), default="")
+
+
+def _is_drawn(file: Path | None) -> bool:
+    return file is not None and DRAWN.search(f"{file.parent.name}/{file.name}") is not None
 
 
 @dataclass(frozen=True)

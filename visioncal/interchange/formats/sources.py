@@ -63,10 +63,9 @@ _SHUT = dict.fromkeys((".pkl", ".pickle", ".p"), _PICKLE) | dict.fromkeys(
 )
 # Lines of a camera_info's matrix and coefficients.
 _CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
-# Rank of rows that are no recording beside others.
-ASIDE = 8
-# Readings of one source that are tested, and names of rows that are a robot's.
-_MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
+# Readings of one source that are tested, the rank of rows that are no recording beside others, and
+# names of rows that are a robot's.
+_MOST_READINGS, ASIDE, _NAMED = 16, 8, re.compile("pose|robot|arm", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,9 +278,8 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     for fields in [each for each in rows if _has(each, given)] or rows:
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
-        # A result of another program has a row or two.
+        # A result of another program has a row or two; a list of a few beside many is of checks.
         later += ASIDE * (len(fields) < FEWEST_ROWS)
-        # A list of a few poses beside many of the robot's is of checks.
         later += ASIDE * (2 * len(fields) < max(of_robot, default=0))
         options = _with_joints(fields, requested)
         joints = options.joints or joint_names(fields, ())
