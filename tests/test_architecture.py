@@ -286,12 +286,18 @@ def identifiers(found_nodes):
                 yield found
 
 
+# Pronouns and adverbs, which do not say the thing that they name.
+PRONOUNS = {
+    *["it", "own", "mine", "ours", "theirs", "whose", "both", "beside", "here", "there", "alone"]
+}
+
+
 def test_names_have_the_terms_of_the_field():
     for path in modules():
         vague = {
             identifier
             for identifier in identifiers(nodes(path))
-            if identifier == "it" or VAGUE & set(identifier.lower().split("_"))
+            if identifier in PRONOUNS or VAGUE & set(identifier.lower().split("_"))
         }
         assert not vague, (path, vague)
 

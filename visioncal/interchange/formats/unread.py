@@ -196,9 +196,9 @@ def point_pairs(source: Source) -> PointPairs | None:
             is_one = rotation_angle(motion[:3, :3]) < _MOST_RESIDUAL
             agree = rms_m < _MOST_RESIDUAL * extent_m and not is_one
             if agree or (len(items) == 2 and ["camera"] in (one.sides, other.sides)):
-                ours = [one, other] if _is_robot(one, other) else [other, one]
+                ordered = [one, other] if _is_robot(one, other) else [other, one]
                 sides = points if _is_robot(one, other) else points[::-1]
-                names = (_named(ours[0]), _named(ours[1]))
+                names = (_named(ordered[0]), _named(ordered[1]))
                 places = tuple(fields.places[at] for at in present)
                 found.append(PointPairs(names, places, sides, rms_m, agree))
     return min(found, key=lambda pairs: pairs.rms_m, default=None)
