@@ -1,18 +1,21 @@
 """Transforms, quantiles, and figures as messages and pages state them."""
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, f, t
+from support.refusals import raised
 from support.slopes import jacobian
 from typing_extensions import TypeAliasType
 
 import visioncal
 from visioncal.core import transforms
+from visioncal.core.codec import read_value
+from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, rounded_up, sigma_words, significant
 from visioncal.core.quantiles import chi2_limit, f_limit, root_of, t_chance
@@ -183,3 +186,21 @@ def test_a_sigma_beyond_all_cells_is_called_not_determined():
 def test_numbers_are_chosen_evenly_and_none_of_an_empty_range(count, chosen):
     # A robot that never moved has one stop, and a change needs two on either side of it.
     assert evenly(count, 3).tolist() == chosen
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "step"),
+    [
+        (float, "0.123456789", "Write it without quotes: 0.123456789."),
+        (float, " 1234567 ", "Write it without quotes: 1234567."),
+        (Literal[1], "1", "Write it without quotes: 1."),
+        (Literal["one", "two"], "1", ""),
+        (int, "3.5", ""),
+        (float, "nan", ""),
+        (float, "one", ""),
+        (bool, "1", ""),
+        (str, 1, ""),
+    ],
+)
+def test_a_number_in_quotes_is_to_be_written_as_it_is_where_it_would_pass(kind, value, step):
+    assert raised(DataError, "x is", read_value, kind, value, "x").next_step == step

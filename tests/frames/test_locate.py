@@ -671,3 +671,9 @@ def test_the_only_tool_touches_or_else_the_flange(proved):
     np.testing.assert_array_equal(first(), first("--tool", "grip"))
     refused = visioncal("touch-test", look, "-c", held, "--tool", "grib")
     assert "no tool 'grib'; it has flange_from_grip" in refused.err
+
+
+def test_a_path_in_place_of_a_calibration_is_refused_with_the_call_that_loads_it():
+    words = "calibration is text .'calibration.json'., but must be a Calibration"
+    error = raised(DataError, words, locate, "calibration.json", np.zeros((1, 2)), None)
+    assert error.next_step == "Load it first: visioncal.Calibration.load('calibration.json')."

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tomli_w
 from scipy.io import savemat
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 from support.commands import visioncal
 from support.following import follow
 from support.marks import slow
@@ -1619,6 +1619,30 @@ def test_rows_of_a_slow_motion_are_no_sides_in_turn(tmp_path, is_quaternion_firs
     )
     np.savetxt(tmp_path / "in.txt", rows, fmt="%.6f")
     assert [len(each) for each in reading.read_rows(tmp_path / "in.txt")] == [18]
+
+
+def test_rows_of_a_raster_of_stops_are_sides_in_turn(tmp_path):
+    """A raster of tilts turns from stop to stop as much as one stop on, and not across sides."""
+    rng = np.random.default_rng(0)
+    tilts = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2), axis=2).reshape(-1, 2)
+    places = np.column_stack([0.4 + 0.2 * tilts[:, 0], 0.2 * tilts[:, 1], np.full(25, 0.5)])
+    turned = Rotation.from_euler("xy", tilts) * Rotation.from_euler("x", 3.0)
+    flange = RigidTransform.from_components(places, turned)
+    mounted, board = (
+        RigidTransform.from_components(place, Rotation.from_rotvec(turn))
+        for place, turn in (([0.05, 0.0, 0.1], [0.1, 0.2, 1.5]), ([0.5, 0.1, 0.0], [0.2, 0.0, 0.4]))
+    )
+    seen = (flange * mounted).inv() * board
+    # Places of both sides are known to 1 mm, turns to 0.2 deg.
+    shifts, turns = rng.normal(0.0, 1e-3, (2, 25, 3)), rng.normal(0.0, 2e-3, (2, 25, 3))
+    numbers = [
+        np.hstack(
+            [side.translation + shift, (side.rotation * Rotation.from_rotvec(turn)).as_quat()]
+        )
+        for side, shift, turn in zip((flange, seen), shifts, turns, strict=True)
+    ]
+    np.savetxt(tmp_path / "in.txt", np.stack(numbers, axis=1).reshape(50, 7), fmt="%.6f")
+    assert [len(each) for each in reading.read_rows(tmp_path / "in.txt")] == [25]
 
 
 def test_poses_of_the_board_are_not_taken_for_the_robot_s(tmp_path):

@@ -135,8 +135,8 @@ def _needed(hint: Any, value: object) -> str:  # noqa: ANN401 - a type
     kind = origin or hint
     if hint is Any or not isinstance(kind, type) or isinstance(value, _CLASSES.get(kind, kind)):
         return ""
-    article = "an" if kind.__name__[0] in "AEIOU" else "a"
-    return _WORDS.get(kind, f"{article} {kind.__name__}")
+    name = public(kind).__name__
+    return _WORDS.get(kind, f"{'an' if name[0] in 'AEIOU' else 'a'} {name}")
 
 
 def _array_needed(pixel: type | None, value: object) -> str:
@@ -161,6 +161,14 @@ def _elements(kind: type, value: object) -> Sequence[object] | None:
     return value if isinstance(value, list | tuple) else ()
 
 
+def public(kind: object) -> Any:  # noqa: ANN401 - any type of an annotation
+    """The class by which users know a kind: the one with its files, of what it contains alone."""
+    if not isinstance(kind, type) or hasattr(kind, "load"):
+        return kind
+    known: list[type] = kind.__subclasses__()
+    return next((each for each in known if hasattr(each, "load")), kind)
+
+
 def _refusal(owner: str, name: str, hint: object, faults: Sequence[_Fault]) -> DataError:
     """Says what was given, what is needed, and how to get that."""
     # Of a union's members, the one that got to an element says most.
@@ -174,7 +182,9 @@ def _refusal(owner: str, name: str, hint: object, faults: Sequence[_Fault]) -> D
     if isinstance(value, str | Path):
         seen = f"{_WORDS[str if isinstance(value, str) else Path]} ({str(value)!r})"
         options = (hint, *get_args(hint))
-        loaders = [f"{option.__name__}.load" for option in options if hasattr(option, "load")]
+        loaders = [
+            f"{option.__name__}.load" for option in map(public, options) if hasattr(option, "load")
+        ]
         loaders += ["load_target"] * (Target in options)
         step = f"Load it first: visioncal.{loaders[0]}({str(value)!r})." if loaders else ""
         if choices := [choice for fault in worst for choice in fault.choices]:

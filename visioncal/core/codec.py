@@ -290,7 +290,8 @@ def _one_of(names: Sequence[Any], value: object, kind: Any, path: str) -> Any:  
         is_same_kind = isinstance(value, bool) == isinstance(name, bool)
         if is_same_kind and isinstance(value, type(name)) and value == name:
             return name
-    raise wrong_value(value, needed_of(kind), path, _similar(value, names) or _unquoted(value))
+    step = _similar(value, names) or _unquoted(value, names)
+    raise wrong_value(value, needed_of(kind), path, step)
 
 
 def _read_marked(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - see `read_value`
@@ -404,7 +405,7 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
     """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
-        raise wrong_value(value, needed_of(kind), path, _unquoted(value) if kind is not str else "")
+        raise wrong_value(value, needed_of(kind), path, _unquoted(value, (), kind))
     try:
         return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
     except OverflowError as error:
@@ -416,12 +417,16 @@ def _similar(value: object, names: Collection[Any]) -> str:
     return did_you_mean(value, texts) if isinstance(value, str) else ""
 
 
-def _unquoted(value: object) -> str:
-    """Advice on a number that is written as a text."""
+def _unquoted(value: object, names: Collection[Any], kind: type = int) -> str:
+    """Advice on a number that is written as a text: one of some names, or any of a kind."""
+    if not isinstance(value, str) or kind not in (int, float):
+        return ""
     try:
-        return f"Write it without quotes: {float(value):g}." if isinstance(value, str) else ""
+        number = kind(value)
     except ValueError:
         return ""
+    fits = number in names if names else math.isfinite(number)
+    return f"Write it without quotes: {value.strip()}." if fits else ""
 
 
 def wrong_value(value: object, needed: str, path: str, next_step: str = "") -> DataError:

@@ -474,7 +474,7 @@ class Problem:
         return np.asarray(self._variances(noise) * self._own_covariance)
 
     def weights(self, noise: Noise) -> FloatArray:
-        """Inverses (n, 6, 6) of `covariance`; zero for observations that `is_single` has."""
+        """Inverses (n, 6, 6) of `covariance`; zero where `is_single` is true."""
         return np.asarray(self._own_weights / self._variances(noise))
 
     def total_covariance(self, linear: Linear, noise: Noise) -> FloatArray:

@@ -31,8 +31,6 @@ from visioncal.robot.errors import pose_basis
 from visioncal.session.frames import edge_names
 from visioncal.vision.camera import intrinsics
 
-# Locating a pixel takes a millisecond; the arm's model is slow to import.
-
 # A transform, or its (4, 4) matrix.
 Pose: TypeAlias = FloatArray | RigidTransform
 

@@ -38,6 +38,7 @@ _DIFFERENT = float(chi2_limit(0.05, 6))
 # Sigma of a board's size where another one is tried, the least error that is named, and the share
 # of the scatter that it explains.
 _ANY_SIZE, _LEAST_SIZE, _EXPLAINED = 0.1, 2e-3, 0.75
+_FEWEST_FOR_SIZE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,7 +415,8 @@ def place_target(
 def _size_warning(fit: _ImageInliers, candidates: _CandidateViews) -> Iterator[str]:
     """Warning on a board of another size, where that makes images from several sides agree."""
     scatter = 6.0 * (int(fit.inliers.sum()) - 1) * (fit.variance - 1.0)
-    if scatter < chi2_limit(FALSE_ALARM, 1):
+    # Two images agree by a size whatever else moved.
+    if scatter < chi2_limit(FALSE_ALARM, 1) or fit.inliers.sum() < _FEWEST_FOR_SIZE:
         return
     common = candidates.common.copy()
     common[-1, -1] = _ANY_SIZE**2
@@ -428,7 +430,7 @@ def _size_warning(fit: _ImageInliers, candidates: _CandidateViews) -> Iterator[s
             f"The images agree if the board is {figure(100.0 * abs(share))} % {than} than stated "
             f"(scatter {figure(np.sqrt(sized.variance))} times the calibration's noise, "
             f"{figure(np.sqrt(fit.variance))} as stated), or the lens was focused anew: measure "
-            "the board, and state its size in its .toml."
+            "the board, and state its size (square_m, or diameter_m, in its .toml)."
         )
 
 

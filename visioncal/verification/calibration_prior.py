@@ -27,6 +27,8 @@ _REPEATED = 0.5
 # Views that were left out without a cause are errors of the arm, which come again, from this number
 # and this share on; fewer are mistakes of rows.
 _FEWEST_STRAYS, _SHARE_OF_STRAYS = 3, 0.1
+# Findings whose views are left out without a cause.
+_NO_CAUSE = ("wrong_views", "lost_views", "unexplained")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,7 @@ class CalibrationPrior:
         """
         limits, views = CalibrationLimits(), self.calibration.views
         findings = self.calibration.verdict.findings
-        explained = {view for one in findings if one.kind != "wrong_views" for view in one.views}
+        explained = {view for one in findings if one.kind not in _NO_CAUSE for view in one.views}
         strays = [
             (view.residual_deg or 0.0, view.residual_mm)
             for view in views
@@ -132,10 +134,12 @@ class CalibrationPrior:
             if (view.residual_deg or 0.0) < limits.scatter_deg[0]
         ]
         count = sum(view.used for view in views) + len(strays)
-        if len(strays) < max(_FEWEST_STRAYS, _SHARE_OF_STRAYS * count):
+        is_of_arm = self.calibration.arm_errors is not None
+        if not is_of_arm or len(strays) < max(_FEWEST_STRAYS, _SHARE_OF_STRAYS * count):
             return deg, mm
         share, squares = 1.0 - len(strays) / count, np.square(strays).sum(axis=0) / (3.0 * count)
-        deg, mm = np.sqrt(share * np.square((deg, mm)) + squares).tolist()
+        stray = np.sqrt(share * np.square((deg, mm)) + squares)
+        deg, mm = np.maximum(stray, (deg, mm)).tolist()
         return deg, mm
 
     @property

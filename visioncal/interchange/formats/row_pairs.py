@@ -70,7 +70,8 @@ def paired_rows(table: TextTable, path: Path) -> Fields | None:
 def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
     """Whether even and odd rows are poses that turn by the same angles, and no copies.
 
-    In a slow motion of one side, a row turns as much like the next one as like its own.
+    In a slow motion of one side, a row turns as much like the next one as like the one beside it,
+    and lies between its neighbours. In a raster of two sides it does the first as well.
     """
     if not all(is_number(cell) for row in rows for cell in row):
         return False
@@ -84,4 +85,9 @@ def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
     first, second = (np.abs(side @ side.T) if is_short else side @ side.T for side in (even, odd))
     copied, apart = np.median(np.abs(even - odd)), np.median(np.abs(first - second))
     later = np.median(np.abs(first[1:, 1:] - second[:-1, :-1]))
-    return bool(apart < _TURN_ALIKE * np.ptp(first) <= copied and 2.0 * apart < later)
+    across, along = (np.sum(even[: len(side)] * side, axis=1) for side in (odd, even[1:]))
+    if is_short:
+        across, along = np.abs(across), np.abs(along)
+    is_beside = np.median(across) < np.median(along)
+    alike = apart < _TURN_ALIKE * np.ptp(first) <= copied
+    return bool(alike and (2.0 * apart < later or is_beside))
