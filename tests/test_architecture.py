@@ -81,7 +81,7 @@ def test_packages_import_only_from_those_before():
             assert not wrong, (path, wrong)
 
 
-def test_files_are_read_in_one_go():
+def test_no_file_is_over_500_lines():
     sizes = {path: len(path.read_text().splitlines()) for path in modules()}
     assert {str(path): size for path, size in sizes.items() if size > 500} == {}
 

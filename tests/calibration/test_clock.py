@@ -279,11 +279,13 @@ def test_the_offset_is_found_by_a_sweep():
     assert clock.shutter is None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "how", "is_stated"),
-    [(0, SHORT, True), (1, HURRIED, True), (1, FAST, False)],
-    ids=["global", "rolling", "rolling before an open lens"],
+    [
+        pytest.param(0, SHORT, True, id="global", marks=pytest.mark.slow),
+        pytest.param(1, HURRIED, True, id="rolling"),
+        pytest.param(1, FAST, False, id="rolling before an open lens", marks=pytest.mark.slow),
+    ],
 )
 def test_images_are_placed_in_time_by_their_corners_and_their_readout_is_found(
     seed, how, is_stated

@@ -7,6 +7,6 @@ from visioncal.calibration.guess.decide import (
     Guess,
     guess_reading,
 )
-from visioncal.calibration.guess.fit import CAMERA_OVER_BOARD, are_of_camera
+from visioncal.calibration.guess.fit import CAMERA_OVER_BOARD, SWITCH_OFF, are_of_camera
 from visioncal.calibration.guess.readings import Hypothesis
 from visioncal.calibration.guess.recording import CLEAR, FEWEST_ROWS, Candidate

@@ -59,8 +59,14 @@ _SAME_M, _PARALLEL = 0.02, np.cos(np.radians(2.0))
 # Poses that are so found.
 CAMERA_OVER_BOARD = (
     "the robot's poses are those of the camera over the board, or of the board before the camera: "
-    "by them, the camera is in its place and the board in its own, and no robot is anywhere. "
-    "Another program found them in the same images"
+    "by them, the camera is within 20 mm and 2 deg of the flange, and the board of the base. "
+    "Another program found them in the same images, or the controller's tool is the camera, and "
+    "its base the board"
+)
+# Next step of both.
+SWITCH_OFF = (
+    "where the controller has the camera as its tool and the board as its base, switch both off "
+    "and record again"
 )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import CAMERA_OVER_BOARD, are_of_camera
+from visioncal.calibration.guess.fit import CAMERA_OVER_BOARD, SWITCH_OFF, are_of_camera
 from visioncal.calibration.pipeline.guess_inputs import chain_fit
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN
@@ -88,6 +88,9 @@ def _middle_m(run: RunState, flange_from_target: FloatArray) -> float:
 
 def of_camera(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are the camera's, before anything is fitted."""
+    matched = run.reported.matched
+    if run.mount not in MOUNTS or (matched is not None and matched.joints_rad):
+        return
     fit = chain_fit(run.base_from_flange, run.poses_of_one_board, run.session.mount)
     if fit is not None and fit.closes and (found := _of_camera(run, fit.x, fit.z)):
         yield found
@@ -101,8 +104,7 @@ def _of_camera(run: RunState, camera: FloatArray, target: FloatArray) -> Finding
         "camera_poses",
         f"{CAMERA_OVER_BOARD[0].upper()}{CAMERA_OVER_BOARD[1:]}.",
         Remedy(
-            "Convert the recording again, with the poses that the robot reported; these say "
-            "nothing of it."
+            f"Convert the recording again, with the poses that the robot reported; {SWITCH_OFF}."
         ),
         is_fatal=bool(run.corners),
         until_mm=0.0,

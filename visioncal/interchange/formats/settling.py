@@ -16,6 +16,7 @@ from visioncal.calibration.guess import (
     FEWEST_ROWS,
     NO_READING,
     ONE_AXIS,
+    SWITCH_OFF,
     Guess,
     are_of_camera,
 )
@@ -230,7 +231,7 @@ def _tested(
             f"{readings[0][1].name}: {CAMERA_OVER_BOARD}.",
             culprits=[str(of_camera[0].robot.places[0])],
             next_step="Name the poses that the robot reported with --robot-key or --robot-columns, "
-            "or their file.",
+            f"or their file; {SWITCH_OFF}.",
         )
     if not found:
         return None, why
