@@ -14,7 +14,9 @@ from support.marks import slow
 import visioncal
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import invert, log
+from visioncal.interchange.formats.mending import shift_views
 from visioncal.results import Calibration
+from visioncal.session import Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, RobotAt, cell_session, simulate
 from visioncal.simulation.layout import CELL
@@ -259,3 +261,81 @@ def test_the_only_board_of_two_cameras_has_a_size(tmp_path):
     assert [cause.kind for cause in found.verdict.causes[:1]] == ["board_size"]
     # By the robot's motion; its sigma is below a tenth of a percent.
     assert found.boards["board"].shape["scale"] == pytest.approx(-0.05, abs=1e-3)
+
+
+def one_picture_lost(folder: Path, camera: str, first: int) -> None:
+    """The pictures of a camera from one of its rows on are those of the rows after them."""
+    with (folder / "views.csv").open(encoding="utf-8") as file:
+        own = [row["view"] for row in csv.DictReader(file) if row["camera"] == camera]
+    of = dict(zip(own[first + 1 :], own[first:], strict=False))
+
+    def change(rows: Rows) -> Rows:
+        kept = (row for row in rows if row["view"] != own[first])
+        return [row | {"view": of.get(row["view"], row["view"])} for row in kept]
+
+    edit_rows(folder, change, "corners.csv")
+    edit_rows(folder, lambda rows: [row for row in rows if row["view"] != own[-1]])
+
+
+@pytest.mark.parametrize("first", [0, 8])
+def test_pictures_of_one_camera_that_are_apart_leave_the_robots_poses_to_the_other(
+    tmp_path, monkeypatch, first
+):
+    monkeypatch.chdir(tmp_path)
+    cell = stereo(tmp_path / "cell")
+    one_picture_lost(tmp_path / "cell", "right", first)
+    cause = visioncal.calibrate("cell").verdict.causes[0]
+    assert "in its rows of cam_right and target_board" in cause.words
+    assert ":1:images" in cause.do.command
+    mended(cell)
+
+
+def test_pictures_without_a_pose_are_given_to_the_stops_of_the_robot(tmp_path):
+    stereo(tmp_path / "cell")
+
+    def change(rows: Rows) -> Rows:
+        for row in rows:
+            row.update(dict.fromkeys((*POSE, "robot"), "") if row["camera"] == "right" else {})
+        return rows
+
+    edit_rows(tmp_path / "cell", change)
+    session = Session.load(tmp_path / "cell")
+    posed = {view.stop: view for view in session.views if view.base_from_flange() is not None}
+    own = {view.number: view.stop for view in session.views if view.text.get("camera") == "right"}
+    stops = sorted(posed)
+    late = [number for number, stop in own.items() if stop > stops[3] and stop in stops]
+    given = {view.number: view for view in shift_views(session, late, -1, True).views}
+    moved = [number for number in late if number in given]
+    assert len(moved) >= len(late) - 3
+    for number in moved:
+        before = stops[stops.index(own[number]) - 1]
+        assert given[number].stop == before
+        assert given[number].text["camera"] == "right"
+        assert [given[number].cell(at) for at in POSE] == [posed[before].cell(at) for at in POSE]
+
+
+def test_a_robot_whose_rows_are_all_apart_is_named_where_nothing_else_ties_it(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.0, 0.0))),
+        cameras=(CameraAt("top", CELL, place_m=(0.0, -1.0, 1.1)),),
+        boards=(BoardAt("one", "a"), BoardAt("other", "b")),
+        stops=16,
+        seed=1,
+    )
+    cell_session(simulate(options), "cell", seen="corners").save(tmp_path / "cell")
+
+    def change(rows: Rows) -> Rows:
+        own = [row for row in rows if row["robot"] == "b" and row["x_m"]]
+        poses = [{name: row[name] for name in POSE} for row in own]
+        for row, pose in zip(own[1:], poses, strict=False):
+            row.update(pose)
+        return [{name: row[name] for name in row if not name.endswith("_rad")} for row in rows]
+
+    edit_rows(tmp_path / "cell", change)
+    words = "Robot b, in its rows of cam_top and target_other: .* 1 row apart.* nothing ties base_b"
+    raised(DegenerateError, words, visioncal.calibrate, "cell")
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert followed.last.status == 0

@@ -15,9 +15,9 @@ def changed(folder: Path, name: str, old: str, new: str) -> Path:
     return folder
 
 
-def edit_rows(folder: Path, change: Callable[[Rows], Rows]) -> None:
-    """Puts what a function makes of the rows of views.csv in their place."""
-    path = folder / "views.csv"
+def edit_rows(folder: Path, change: Callable[[Rows], Rows], name: str = "views.csv") -> None:
+    """Puts what a function makes of the rows of a table in their place."""
+    path = folder / name
     with path.open(newline="", encoding="utf-8") as file:
         rows = change([*csv.DictReader(file)])
     with path.open("w", newline="", encoding="utf-8") as file:

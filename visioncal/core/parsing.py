@@ -59,12 +59,13 @@ def views_in(words: str, option: str) -> tuple[int, ...]:
     return tuple(found)
 
 
-def shift_in(words: str, option: str) -> tuple[tuple[int, ...], int]:
-    """Parses views and the number of rows that they are apart, written as 12-24:2."""
-    views, _, by = words.partition(":")
-    is_right = by.removeprefix("-").isdecimal() and int(by) != 0
-    _check(is_right, words, option, "views and a number of rows, as 12-24:2")
-    return views_in(views, option), int(by)
+def shift_in(words: str, option: str) -> tuple[tuple[int, ...], int, bool]:
+    """Parses views, by how many rows they are apart, and of images: 12-24:2 or 12-24:2:images."""
+    views, _, rest = words.partition(":")
+    by, _, of = rest.partition(":")
+    is_right = by.removeprefix("-").isdecimal() and int(by) != 0 and of in ("", "images")
+    _check(is_right, words, option, "views and a number of rows, as 12-24:2 or 12-24:2:images")
+    return views_in(views, option), int(by), bool(of)
 
 
 def turn_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]]:

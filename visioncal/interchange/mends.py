@@ -23,8 +23,10 @@ class Mends:
         "Pairs of views whose images are exchanged, one after the other: 8,17,9,16.", parse=pairs_in
     )
     # Earlier where negative.
-    shift: tuple[tuple[int, ...], int] | None = mend_option(
-        "Views whose poses stand so many rows later: 12-24:2.", parse=shift_in
+    shift: tuple[tuple[int, ...], int, bool] | None = mend_option(
+        "Views whose poses stand so many rows later: 12-24:2. Of a cell, 12-24:2:images gives "
+        "these images to other stops, and leaves the robot's poses there.",
+        parse=shift_in,
     )
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = mend_option(
         "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60; or, by 0 "

@@ -123,6 +123,13 @@ class Candidate:
         )
 
     @property
+    def rows_apart(self) -> int:
+        """By how many rows later each view's pose stands, where nothing else is read otherwise."""
+        found, declared = self.hypothesis, self.recording.declared
+        by = int(found.rows(FEWEST_ROWS)[1]) - 1
+        return by if replace(found, order="", changes=(), cost=0) == declared else 0
+
+    @property
     def log_posterior(self) -> float:
         """Log posterior of the reading, up to a constant of the views."""
         cost = self.hypothesis.cost

@@ -9,6 +9,7 @@ from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import UNRECORDED, with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
+from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Remedy, of_cell
@@ -27,6 +28,10 @@ def explained(
         words, step = f"{cause.words} {error.message}", str(cause.do or "")
         return type(error)(words, culprits=error.culprits, next_step=step)
     is_pair = state.mount is not None
+    # Of a whole cell, views that a mistake explains were left out before the fit.
+    for found in (at for at in state.warnings if at.kind in UNDONE and not is_pair):
+        words = f"{found.words} {error.message}"
+        return type(error)(words, culprits=error.culprits, next_step=str(found.do or ""))
     if is_pair and not are_located:
         return error
     state = with_misreading(state)

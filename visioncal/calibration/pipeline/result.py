@@ -111,10 +111,17 @@ def _edge_names(run: RunState) -> dict[str, str]:
     problem = answer.fit.problem
     # In the order of the fit, whose covariance has a frame that moved at the end.
     parents = {answer.versions[key]: problem.tree.branches[key].parent for key in problem.unknown}
-    # The root of a pair's frames is the robot's base.
-    root = CELL if run.mount is None else "base"
+    if run.mount is None:
+        return {frame: f"{parent}_from_{frame}" for frame, parent in parents.items()}
+    # The root of a pair's frames is the robot's base; its camera and its robot need no names.
+    kinds = {CELL: "base"} | {
+        frame: kind
+        for kind in ("flange", "cam")
+        for frame in (*parents, *parents.values())
+        if frame.startswith(f"{kind}_")
+    }
     return {
-        frame: f"{root if parent == CELL else parent}_from_{frame}"
+        frame: f"{kinds.get(parent, parent)}_from_{kinds.get(frame, frame)}"
         for frame, parent in parents.items()
     }
 

@@ -30,6 +30,7 @@ from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.late_poses import by_joints
 from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
+from visioncal.calibration.suspects.mistaken_rows import Undoing
 from visioncal.calibration.suspects.moved_views import IN_MOTION
 from visioncal.calibration.suspects.other_rows import of_other_rows
 from visioncal.calibration.suspects.pairs_alone import of_all_rows
@@ -141,10 +142,11 @@ def with_undone(run: RunState) -> RunState:
         return run
     for robot in run.session.robots:
         stops, commands = _stops_of(run, robot), set[str]()
-        for pair in pairs_of(run, robot):
-            mistake = likeliest(of_pair(run, robot, pair), stops)
+        pairs = [(at, likeliest(of_pair(run, robot, at), stops)) for at in pairs_of(run, robot)]
+        for pair, mistake in pairs:
             if mistake is None:
                 continue
+            of_images = _is_of_images(run, mistake.found, pair, pairs)
             subject = robot_words(robot)
             subject = (
                 f"{subject[0].upper()}{subject[1:]}, in its rows of {pair.camera} and {pair.target}"
@@ -155,14 +157,34 @@ def with_undone(run: RunState) -> RunState:
                 others = [at.number for at in run.session.views if at.number not in found.views]
                 do = or_alone(do.words, others)
             else:
-                do = of_all_rows(found, run, robot, pair)
-            found = replace(found, words=f"{subject}: {found.words}", do=do)
+                do = of_all_rows(found, run, robot, pair, of_images=of_images)
+            fits = " The images of other cameras fit its poses." if of_images else ""
+            found = replace(found, words=f"{subject}: {found.words}{fits}", do=do)
             # One command mends the robot's rows of all pairs.
             command = "" if do is None else do.command
             run = undone(run, replace(mistake, found=found), is_named=command in commands)
             commands |= {command} - {""}
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
+
+
+def _is_of_images(
+    run: RunState,
+    found: Finding,
+    pair: CameraTargetPair,
+    every: Sequence[tuple[CameraTargetPair, Undoing | None]],
+) -> bool:
+    """Whether the images of a pair's camera are rows apart, as others fit the poses there."""
+    if found.kind != "shifted_rows":
+        return False
+    stops = {view.number: stop_of(view) for view in run.session.views}
+    there = {stops[view] for view in found.views}
+    others = [
+        mistake is not None and mistake.found.kind == found.kind
+        for one, mistake in every
+        if one.camera != pair.camera and there & {stops[view] for view in one.poses}
+    ]
+    return bool(others) and not any(others)
 
 
 def _stops_of(run: RunState, robot: str) -> dict[int, StopOfRobot]:
@@ -191,7 +213,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
             if (other := _on_another(run, robot, pair)) is not None:
                 yield other
                 break
-            hint = next(_misread_poses(of_pair(run, robot, pair), of_cell=True), None)
+            hint = next(_misread_poses(of_pair(run, robot, pair), (run, robot)), None)
             if hint is None:
                 continue
             within = ""
@@ -200,7 +222,9 @@ def misreadings(run: RunState) -> Iterator[Finding]:
                 seen = " and ".join(filter(None, [pair.camera, pair.target]))
                 within = f", in its rows of {seen}"
             words = f"{subject[0].upper()}{subject[1:]}{within}: {hint.words}"
-            yield replace(hint, words=words, do=of_all_rows(hint, run, robot))
+            of_images = any(one.camera != pair.camera for one in right)
+            do = of_all_rows(hint, run, robot, pair, of_images=of_images)
+            yield replace(hint, words=words, do=do)
             # All of these would show the same.
             break
 
@@ -234,10 +258,22 @@ def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | 
     return None
 
 
-def _misread_poses(run: RunState, *, of_cell: bool = False) -> Iterator[Finding]:
+def _rows_apart(run: RunState, by: int, cell: RunState, robot: str) -> Remedy:
+    """Advice to give all views of a pair of a cell the poses of rows before or after."""
+    views = [view.number for view in run.session.views]
+    order = [*dict.fromkeys(stop_of(view) for view in rows_of_robot(cell.session, robot))]
+    own = {view.number: stop_of(view) for view in cell.session.views}
+    # Rows are counted by the robot's stops, of which the pair may show every other one.
+    steps = {*np.diff([order.index(own[view]) for view in views if own[view] in order]).tolist()}
+    if not by or len(steps) != 1 or any(len(at.robots) > 1 for at in cell.session.observations):
+        return BY_HAND
+    return mending("each has its own pose", f"--shift {ranges(views)}:{by * steps.pop()}")
+
+
+def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) -> Iterator[Finding]:
     """The finding on the reading of one robot's poses that closes the chain, if any.
 
-    Of a whole cell, a command reads the rows of a robot anew, and none else.
+    Within a whole cell, a command reads the rows of this robot anew, or gives them other ones.
     """
     try:
         guess = guess_from_camera_poses(run)
@@ -253,8 +289,8 @@ def _misread_poses(run: RunState, *, of_cell: bool = False) -> Iterator[Finding]
     if guess.stands_out and all(hint.do in (UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
-        if of_cell and not guess.best.is_of_robot:
-            step = BY_HAND
+        if within is not None and not guess.best.is_of_robot:
+            step = _rows_apart(run, guess.best.rows_apart, *within)
         words = guess.sentence
         if robot.mirrored:
             step = _MIRRORED if run.cameras else replace(_MIRRORED, command="")

@@ -46,7 +46,7 @@ _SIZES = (*SOURCES, "few_stops", "too_few_stops", "place", "weak_motion")
 # Frames by two pairs that are further apart than so many sigmas, and than an arm errs, are others.
 _SIGMAS = 6.0
 # Views whose poses or images an option changes, and the tool that one takes off.
-_ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):")
+_ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):(\S+)")
 _TOOL = re.compile(r"--without-tool [\d,-]+:(\S+)")
 
 
@@ -192,12 +192,18 @@ def _is_same(tool: FloatArray, other: FloatArray) -> bool:
 
 
 def of_all_rows(
-    found: Finding, run: RunState, robot: str, pair: CameraTargetPair | None = None
+    found: Finding,
+    run: RunState,
+    robot: str,
+    pair: CameraTargetPair | None = None,
+    *,
+    of_images: bool = False,
 ) -> Remedy | None:
     """A finding's remedy whose command changes all rows of a robot at the stops of its views.
 
     Between two rows that are shifted all are, whether or not they are of the same pair; beyond the
-    first or the last one that a pair has, too.
+    first or the last one that a pair has, too. Where the images of its camera are, and not the
+    poses, these are the camera's rows.
     """
     do, rows = found.do, run.session.views
     named = None if do is None else _ON_VIEWS.search(do.command)
@@ -213,9 +219,13 @@ def of_all_rows(
         first = 0 if pair is not None and min(shown) in found.views else ends[0]
         end = None if pair is not None and max(shown) in found.views else ends[-1] + 1
         stops = {stop_of(at) for at in of_robot[first:end]}
-    start, end = named.span(2)
+    if of_images and pair is not None:
+        seers = {row.view.number: row.seer for row in run.session.observations}
+        of_robot = [view for view in rows if seers.get(view.number) == pair.camera]
     every = ranges([at.number for at in of_robot if stop_of(at) in stops])
-    return replace(do, command=f"{do.command[:start]}{every}{do.command[end:]}")
+    typed = f"{named[1]} {every}:{named[3]}{':images' if of_images else ''}"
+    start, end = named.span()
+    return replace(do, command=f"{do.command[:start]}--{typed}{do.command[end:]}")
 
 
 def _contradictions(run: RunState, every: Sequence[PairAlone]) -> Iterator[Finding]:

@@ -110,33 +110,37 @@ def _chosen_views(session: Session, views: Sequence[int], option: str) -> list[i
     return chosen
 
 
-def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
+def shift_views(
+    session: Session, views: Sequence[int], by: int, of_images: bool = False
+) -> Session:
     """Gives some views the robot's columns of so many rows later, or earlier where negative.
 
-    Of a whole cell, these are rows of one robot, and are counted by its stops. Views whose row
-    there is none, or another view's that stays, are dropped, and `corrected` names them. Raises
-    DataError.
+    Of a whole cell, these are rows of one robot, and are counted by its stops; where their images
+    are apart, and not its poses, they go to the other stop. Views whose row there is none, or
+    another view's that stays, are dropped, and `corrected` names them. Raises DataError.
     """
     moved, rows = set(_chosen_views(session, views, "--shift")), session.views
     kept, of_robot = {*_OBSERVED, *_MUST_AGREE, "view", "role"}, [*range(len(rows))]
     stops = [(-1, at) for at in of_robot]
-    counted_by = "row"
+    counted_by, of_images = "row", of_images and is_whole_cell(session)
     if is_whole_cell(session):
-        of_robot, kept = _rows_of_one_robot(session, moved), {*kept, "stop", "robot"}
-        # Other rows of these stops have no pose of their own to be given another one.
-        moved &= {rows[at].number for at in of_robot}
         # A row without a number of its stop is a stop of its own.
         stops = [(-1, at) if view.stop is None else (view.stop, -1) for at, view in enumerate(rows)]
+        of_robot = _rows_of_one_robot(session, _posed(session, moved) if of_images else moved)
         counted_by = "stop of this robot"
+        if not of_images:
+            kept |= {"stop", "robot"}
+            # Other rows of these stops have no pose of their own to be given another one.
+            moved &= {rows[at].number for at in of_robot}
     order = [*dict.fromkeys(stops[at] for at in of_robot)]
     place_of = {stop: place for place, stop in enumerate(order)}
     first = {stops[at]: at for at in reversed(of_robot)}
-    changed = {stops[at] for at in of_robot if rows[at].number in moved}
+    changed = {stops[at] for at, view in enumerate(rows) if view.number in moved}
     cells, dropped = list[dict[str, str]](), list[int]()
     for at, view in enumerate(rows):
         source = at
         if view.number in moved:
-            place = place_of[stops[at]] + by
+            place = place_of.get(stops[at], -len(rows)) + by
             stop = order[place] if 0 <= place < len(order) else None
             if stop not in changed:
                 dropped.append(view.number)
@@ -146,11 +150,21 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
             {name: (view if name in kept else rows[source]).cell(name) for name in session.columns}
         )
     lost = f"; {ranges(dropped)} had none there and were dropped" if dropped else ""
-    note = f"views {ranges(moved)} have the robot's poses of the {counted_by} {by:+d}{lost}"
+    whose = "are" if of_images else "have the robot's poses"
+    note = f"views {ranges(moved)} {whose} of the {counted_by} {by:+d}{lost}"
     corners = session.corner_table
     if corners is not None:
         corners = corners.of_views([view.number for view in rows if view.number not in dropped])
     return _with_cells(session, cells, note, corners=corners)
+
+
+def _posed(session: Session, views: AbstractSet[int]) -> AbstractSet[int]:
+    """Some views, or all of their stops where none of them has a robot's state."""
+    every = {view.number: view.stop for view in session.views}
+    stops = {every[view] for view in views}
+    if any(has_robot_state(view) for view in session.views if view.number in views):
+        return views
+    return {view for view, stop in every.items() if stop in stops}
 
 
 def _rows_of_one_robot(session: Session, views: AbstractSet[int]) -> list[int]:
