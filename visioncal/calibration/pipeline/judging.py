@@ -17,7 +17,7 @@ from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPai
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN, with_misreading
 from visioncal.calibration.suspects.outliers import EXCHANGED
 from visioncal.calibration.suspects.registry import found_in
-from visioncal.calibration.suspects.suspect import UNDONE
+from visioncal.calibration.suspects.suspect import LIKE_KNOCKS, UNDONE
 from visioncal.core.conventions import controller_form
 from visioncal.core.directions import Direction, Turning, edge_directions
 from visioncal.core.limits import CalibrationLimits
@@ -70,8 +70,9 @@ def judged_beside(state: RunState, found: Sequence[Finding]) -> RunState:
         replace(pair, outliers=[out for out in pair.outliers if out.view not in views])
         for pair in findings.pairs
     ]
-    # Of a robot's tool, all that it carries seems to have moved.
-    effects = ("moved_frame",) if any(each.kind == "something_moved" for each in found) else ()
+    # Of a robot's tool, all that it carries seems to have moved; of a lens, its camera.
+    seem = ("something_moved", *LIKE_KNOCKS)
+    effects = ("moved_frame",) if any(each.kind in seem for each in found) else ()
     warnings = (*found, *(at for at in findings.warnings if at.kind not in effects))
     findings = replace(findings, pairs=pairs, warnings=warnings)
     return _judged(state, findings, judge(findings))

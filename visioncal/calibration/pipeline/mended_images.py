@@ -9,7 +9,7 @@ from pathlib import PurePath
 import cv2
 import numpy as np
 
-from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
+from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses, of_pair
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.cameras import exchanged_columns
@@ -17,6 +17,7 @@ from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.corner_sizes import scaled_px
 from visioncal.calibration.stages.detect import is_scaled
 from visioncal.calibration.stages.other_board import LOOKED_AT_LAST, OtherBoardError, spread
+from visioncal.calibration.stages.robots import pairs_of
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import ranges
@@ -79,9 +80,9 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
     for name, quarters in _turned(located, present).items():
         images[name] = np.ascontiguousarray(np.rot90(images[name], quarters))
         done[name].append(_TURNED[quarters])
-    if not any(done.values()) and _is_mirrored(located):
-        return _mirrored_back(session, located)
     if not any(done.values()):
+        if (mended := _by_motion(session, located)) is not None:
+            return mended
         raise DataError(
             f"session {session.name!r}: nothing was written, as no image is mirrored, turned, a "
             "negative or of another size.",
@@ -137,6 +138,26 @@ def _is_mirrored(state: RunState | None) -> bool:
             guess = guess_from_camera_poses(state)
             return guess.stands_out and guess.best.hypothesis.robot.mirrored
     return False
+
+
+def _by_motion(session: Session, located: RunState | None) -> Session | None:
+    """The session with images or corners mirrored back, as the motion shows, if it does."""
+    if _is_mirrored(located):
+        return _mirrored_back(session, located)
+    exchanged = _exchanged_in_cell(located)
+    return _exchanged_back(session, exchanged) if exchanged else None
+
+
+def _exchanged_in_cell(state: RunState | None) -> list[int]:
+    """Views of those cameras of a whole cell whose lenses show u and v of corners exchanged."""
+    if state is None or state.mount is not None:
+        return []
+    pairs = ((robot, pair) for robot in state.session.robots for pair in pairs_of(state, robot))
+    cameras = {
+        pair.camera for robot, pair in pairs if exchanged_columns(of_pair(state, robot, pair))
+    }
+    rows = state.session.observations
+    return [row.view.number for row in rows if row.seer in cameras and row.view.has_corners]
 
 
 def _with_mended_corners(session: Session) -> Session | None:

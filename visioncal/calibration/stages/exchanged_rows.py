@@ -1,5 +1,6 @@
 """Search for other stops that outliers fit, and for rows that are exchanged."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -119,22 +120,31 @@ def exchanged(
     """Circles of observations that fit each other's stops, each that of the next one.
 
     Pairs, best first, then circles of more by the stop that each fits best; an observation is in
-    one at most. `fitting` is the result of `other_stops`.
+    one at most. Observations of two cameras may have each other's poses of their one robot.
+    `fitting` is the result of `other_stops`.
     """
     seen, circles = problem.observations, list[tuple[int, ...]]()
+    of_flange = {at: problem.observations_through(at) for at in problem.tree.flanges.values()}
     frames = [
         (observer.partition("@")[0], observed.partition("@")[0])
         for observer, observed in zip(seen.observers, seen.observed, strict=True)
     ]
-    stops, mutual = seen.stops.tolist(), list[tuple[int, int, int]]()
+    stops, mutual = seen.stops.tolist(), list[tuple[bool, int, int, int]]()
+    robots = [tuple(at for at, rows in of_flange.items() if rows[row]) for row in range(len(stops))]
+    # How many observations share each pose.
+    shared = Counter(zip(stops, robots, strict=True))
     for a, b in combinations(sorted(fitting), 2):
-        if frames[a] == frames[b] and stops[b] in fitting[a] and stops[a] in fitting[b]:
-            mutual.append((fitting[a].index(stops[b]) + fitting[b].index(stops[a]), a, b))
+        are_poses = len(robots[a]) == 1 and robots[a] == robots[b]
+        are_poses &= shared[stops[a], robots[a]] == shared[stops[b], robots[b]] == 1
+        is_alike = frames[a] == frames[b] or (are_poses and stops[a] != stops[b])
+        if is_alike and stops[b] in fitting[a] and stops[a] in fitting[b]:
+            by = fitting[a].index(stops[b]) + fitting[b].index(stops[a])
+            mutual.append((frames[a] != frames[b], by, a, b))
     left = {*fitting}
     # Where stops are alike, an observation fits several.
-    for _, *pair in sorted(mutual):
-        if left.issuperset(pair):
-            circles.append(tuple(pair))
+    for *_, a, b in sorted(mutual):
+        if left.issuperset(pair := (a, b)):
+            circles.append(pair)
             left.difference_update(pair)
     index_of = {(frames[at], stops[at]): at for at in sorted(left)}
     following = {at: index_of.get((frames[at], fitting[at][0])) for at in left}

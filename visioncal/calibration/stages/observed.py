@@ -9,14 +9,15 @@ from typing import Self
 from visioncal.calibration.stages.clock_offset import ClockedViews, ClockPair
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import listed, some_of
 from visioncal.core.types import Corners, FloatArray, Progress, Rejection, Searched
 from visioncal.core.verdict import Finding
 from visioncal.estimation.scene import Scene
 from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
-from visioncal.session import Session
+from visioncal.session import Session, frame_name
 from visioncal.session.document import CameraTable
+from visioncal.session.kinds import has_robot_state
 from visioncal.vision.pnp import ViewPoses
 
 # Views of one reason that are listed.
@@ -187,6 +188,29 @@ def all_held_back(observed: Observed) -> DataError:
     )
 
 
+def _on_other_robots(observed: Observed) -> DataError | None:
+    """The error where rows state another robot than the one that carries their camera or target."""
+    session, found = observed.session, dict[str, tuple[str, str]]()
+    for row in session.observations:
+        if not (row.missing_robots and has_robot_state(row.view)):
+            return None
+        flange = frame_name("flange", row.missing_robots[0])
+        frame = row.seer if session.frames[row.seer] == flange else row.seen
+        found[frame] = row.missing_robots[0], row.view.text.get("robot", "")
+    each = [
+        f"{frame} is on robot {declared} as [frames] declares, and its rows state the poses of "
+        f"robot {stated}"
+        for frame, (declared, stated) in found.items()
+    ]
+    edits = [f'{frame} = "{frame_name("flange", stated)}"' for frame, (_, stated) in found.items()]
+    return DataError(
+        f"session {session.name!r}: {'; '.join(each)}.",
+        culprits=[*found],
+        next_step=f"Write {listed(edits)} in [frames] of session.toml, or the other robot in "
+        "column robot of these rows in views.csv, and calibrate again.",
+    )
+
+
 def nothing_seen(observed: Observed) -> DataError:
     """The error where no view shows anything to calibrate by."""
     if observed.corners and observed.corners.keys() <= observed.held_back:
@@ -196,6 +220,8 @@ def nothing_seen(observed: Observed) -> DataError:
             f"session {observed.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
+    if (elsewhere := _on_other_robots(observed)) is not None:
+        return elsewhere
     image = next((view.image for view in observed.session.views if view.image), "an image")
     why = "".join(f" ({reason})" for reason in observed.lost_views[:1])
     return DataError(

@@ -10,12 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
-from visioncal.calibration.guess.fit import is_about_one_axis
 from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import (
     both_sides,
-    chain_fit,
     closes,
     guess_from_camera_poses,
     of_pair,
@@ -27,6 +25,7 @@ from visioncal.calibration.stages.cell import rows_of_robot, stop_of
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.declared_frames import carried, on_another
 from visioncal.calibration.suspects.late_poses import by_joints
 from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
@@ -51,7 +50,6 @@ from visioncal.core.verdict import (
     mending,
     or_alone,
 )
-from visioncal.session import frame_name
 from visioncal.session.columns import POSE
 
 # A robot that moves by less stood still [m].
@@ -210,7 +208,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         wrong, right = open_pairs(run, robot, run.robots[robot].base_from_flange)
         subject = robot_words(robot)
         for pair in wrong:
-            if (other := _on_another(run, robot, pair)) is not None:
+            if (other := on_another(run, robot, pair)) is not None:
                 yield other
                 break
             hint = next(_misread_poses(of_pair(run, robot, pair), (run, robot)), None)
@@ -227,35 +225,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
             yield replace(hint, words=words, do=do)
             # All of these would show the same.
             break
-
-
-def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:
-    """The finding that a camera or a target is on another robot's flange than is declared."""
-    stops = {view.number: view.stop for view in run.session.views}
-    declared = chain_fit(run.robots[robot].base_from_flange, pair.poses, pair.mount)
-    for other in (name for name in run.robots if name != robot):
-        other_poses = run.robots[other].base_from_flange.items()
-        by_stop = {stops[view]: pose for view, pose in other_poses}
-        poses = {view: by_stop[stops[view]] for view in pair.poses if stops[view] in by_stop}
-        # A robot that waited, or turned about one axis, agrees with much.
-        turns = np.array([pose[:3, :3] for pose in poses.values()]).reshape(-1, 3, 3)
-        if len(turns) < FEWEST_ROWS or is_about_one_axis(turns):
-            continue
-        found = chain_fit(poses, pair.poses, pair.mount)
-        if found is not None and declared is not None and found.closes:
-            frame = pair.camera if pair.mount == "eye-in-hand" else pair.target
-            return Finding(
-                "misread_poses",
-                f"{frame} is on robot {other}, and not on robot {robot} as [frames] declares: "
-                f"with the poses of robot {other}, robot and camera agree to {found.figures}, "
-                f"with those of robot {robot} to {declared.figures}.",
-                Remedy(
-                    f'Write {frame} = "{frame_name("flange", other)}" in [frames] of session.toml, '
-                    "and calibrate again.",
-                    CALIBRATE,
-                ),
-            )
-    return None
+    yield from carried(run)
 
 
 def _rows_apart(run: RunState, by: int, cell: RunState, robot: str) -> Remedy:

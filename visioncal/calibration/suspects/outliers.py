@@ -101,10 +101,11 @@ def explained_outliers(
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
     faults += _turned(cell_fit, outliers) if not faults else ()
-    if cell_fit.cell.mount is not None and not faults:
-        faults += of_moved(cell_fit, outliers)
-    if cell_fit.cell.mount is None and not faults:
-        faults += [*_misnamed(cell_fit, outliers)] or pushed_base(cell_fit)
+    is_pair = cell_fit.cell.mount is not None
+    if not faults and (not is_pair or len(session.boards) > 1):
+        faults += _misnamed(cell_fit, outliers)
+    if not faults:
+        faults += of_moved(cell_fit, outliers) if is_pair else pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, circles) for at in outliers.tolist()} | clauses
     return tuple(faults), *_reasons(cell_fit, causes)
@@ -142,7 +143,13 @@ def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
         frames = rows[at].seer, rows[at].seen
         side = int(frames[0].partition("@")[0] == names[0])
         by_names[frames[side].partition("@")[0], names[side]].append(at)
-    several = {names: some for names, some in by_names.items() if len(some) >= _FEWEST_MISNAMED}
+    # Exchanged names, one in place of the other, are one mistake.
+    count = Counter(frozenset(names) for names, some in by_names.items() for _ in some)
+    several = {
+        names: some
+        for names, some in by_names.items()
+        if count[frozenset(names)] >= _FEWEST_MISNAMED
+    }
     if not several:
         return
     every, edits = sorted(chain.from_iterable(several.values())), list[str]()

@@ -5,6 +5,7 @@ frames that moved. Where pairs agree by themselves, and not with each other, tha
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,12 +18,13 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import rows_of_robot, stop_of
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.moved_views import (
+    IN_MOTION,
     KNOCKED,
     other_frame,
     turned_back,
     without_tool,
 )
-from visioncal.calibration.suspects.suspect import SOURCES, UNEXPLAINED, Suspect
+from visioncal.calibration.suspects.suspect import LIKE_KNOCKS, SOURCES, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, ranges, robot_words, some_of, view_words
@@ -40,7 +42,8 @@ _MOST_PAIRS = 8
 # Kinds of a cell's first cause behind which a pair may show more: no cause, or effects of one.
 _OPEN = ("", UNEXPLAINED, "wrong_views", "lost_views", "moved_frame")
 # Kinds of causes that a cell's own fit does not find. Those of a robot are in all of its pairs.
-_OF_ROBOT, _OF_CAMERA = ("something_moved", "late_poses"), ("other_lens", "image_sizes", "lens")
+_OF_ROBOT = ("something_moved", "late_poses")
+_OF_CAMERA = ("other_lens", "image_sizes", "lens", "exchanged_views")
 # Causes of a pair whose views agree.
 _SIZES = (*SOURCES, "few_stops", "too_few_stops", "place", "weak_motion")
 # Frames by two pairs that are further apart than so many sigmas, and than an arm errs, are others.
@@ -81,9 +84,15 @@ def is_open(run: RunState) -> bool:
     if run.mount is not None or verdict is None or verdict.status == "good":
         return False
     kind = next((cause.kind for cause in verdict.causes), "")
-    moves = ((move.shift_mm, move.turn_deg) for move in run.assessment.moved)
-    is_knock = kind == "moved_frame" and not any(np.greater(by, KNOCKED).any() for by in moves)
-    return kind in _OPEN and not is_knock
+    knocked = _knocked(run) if kind == "moved_frame" else ()
+    return kind in _OPEN and (not knocked or any(frame.startswith("cam") for frame in knocked))
+
+
+def _knocked(run: RunState) -> tuple[str, ...]:
+    """The frames that moved, where they did so by no more than what is knocked does."""
+    moves = () if run.assessment_or_none is None else run.assessment_or_none.moved
+    is_far = any(np.greater((move.shift_mm, move.turn_deg), KNOCKED).any() for move in moves)
+    return () if is_far else tuple(move.frame for move in moves)
 
 
 def pairs_alone(run: RunState, calibrated: PairRun) -> list[PairAlone]:
@@ -114,24 +123,53 @@ def pairs_alone(run: RunState, calibrated: PairRun) -> list[PairAlone]:
 
 def found_alone(run: RunState, every: Sequence[PairAlone]) -> Iterator[Finding]:
     """Causes that pairs show by themselves, and where two of them contradict each other."""
+    knocked = _knocked(run)
     for robot in run.session.robots:
         of_robot = [one for one in every if one.robot == robot]
-        causes = dict[str, list[tuple[PairAlone, Finding]]]()
+        causes = defaultdict[str, list[tuple[PairAlone, Finding]]](list)
         for one in of_robot:
             verdict = one.answer.verdict
             for cause in () if verdict is None else verdict.causes[:2]:
-                causes.setdefault(cause.kind, []).append((one, cause))
-        # Of one camera alone, the camera itself was moved, as the cell's own fit says.
-        shared = [kind for kind in _OF_ROBOT if len(causes.get(kind, ())) == len(of_robot) > 0]
-        for kind in shared:
-            tool = _tool_switched(run, robot, causes[kind]) if kind == "something_moved" else None
-            if tool is not None or kind != "something_moved":
-                yield tool or causes[kind][0][1].of(robot_words(robot))
-        for kind in _OF_CAMERA:
-            for one, cause in causes.get(kind, ()):
-                yield cause.of("" if len(run.session.cameras) < 2 else one.pair.camera)
-        if not shared:
-            yield from _contradictions(run, of_robot)
+                causes[cause.kind].append((one, cause))
+        yield from _of_cameras(run, causes, knocked)
+        if not knocked:
+            # Of one camera alone, the camera itself was moved, as the cell's own fit says.
+            shared = [kind for kind in _OF_ROBOT if len(causes[kind]) == len(of_robot) > 0]
+            yield from (each for kind in shared for each in _of_robot(run, robot, causes[kind]))
+            yield from () if shared else _contradictions(run, of_robot)
+
+
+def _of_cameras(
+    run: RunState,
+    causes: Mapping[str, Sequence[tuple[PairAlone, Finding]]],
+    knocked: Sequence[str],
+) -> Iterator[Finding]:
+    """Causes of single cameras; where frames seem to have been knocked, those that look like it."""
+    for kind in LIKE_KNOCKS if knocked else (*LIKE_KNOCKS, *_OF_CAMERA):
+        for one, cause in causes[kind]:
+            if knocked and {*knocked} != {one.pair.camera}:
+                continue
+            found = cause.of("" if len(run.session.cameras) < 2 else one.pair.camera)
+            if kind in LIKE_KNOCKS and cause.do is not None:
+                # The pair's later views are not all that could be calibrated alone.
+                do = Remedy(f"{cause.do.words.partition(';')[0].removesuffix('.')}.")
+                words = f"{found.words.partition(' The result counts')[0]}"
+                words += " The result treats the camera as moved." if knocked else ""
+                found = replace(found, words=words, do=do)
+            yield found
+
+
+def _of_robot(
+    run: RunState, robot: str, shown: Sequence[tuple[PairAlone, Finding]]
+) -> Iterator[Finding]:
+    """The cause of one kind that all pairs of a robot show."""
+    first = shown[0][1]
+    if first.kind == "something_moved" and any(cause.do != IN_MOTION for _, cause in shown):
+        tool = _tool_switched(run, robot, shown)
+        yield from () if tool is None else (tool,)
+        return
+    views = sorted({view for _, cause in shown for view in cause.views})
+    yield replace(first.of(robot_words(robot)), views=tuple(views))
 
 
 def _tool_switched(

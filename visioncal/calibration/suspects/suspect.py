@@ -18,6 +18,8 @@ UNDONE = (
 )
 # All that explains that views disagree, or that the flange is off.
 CHAIN = "chain"
+# Changes of a lens, which look like a camera that was knocked.
+LIKE_KNOCKS = ("focus", "image_shifted")
 STEPS = ("moved_at_once", "joint_slipped", "board_changed")
 # Sources of the errors of picks, whose probability is their share.
 SOURCES = (

@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.guess_inputs import numbers_in
 from visioncal.calibration.pipeline.mended_images import with_turned_images
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import ranges, some_of
+from visioncal.core.number_format import listed, ranges, some_of
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import Session
@@ -34,6 +34,8 @@ _OBSERVED = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUAT
 _OF_LENS = ("matrix", "distortion", "intrinsics", "matrix_sigma_px")
 # Columns that must agree between the two views.
 _MUST_AGREE = ("camera", "target", "instrument", "point")
+# Columns of the row itself, of whatever pose and image it is.
+_OF_ROW = ("view", "role", "stop", "robot")
 
 
 def noting(
@@ -47,6 +49,8 @@ def noting(
 def exchange_views(session: Session, *views: int) -> Session:
     """Exchanges the images, corners and readings of pairs of views; notes it in `corrected`.
 
+    Of a pair that is of two cameras or targets, one robot's poses are exchanged.
+
     Args:
         session: A session.
         views: Numbers of views: the first with the second, then the third with the fourth, and so
@@ -59,33 +63,41 @@ def exchange_views(session: Session, *views: int) -> Session:
         view.number: {name: view.cell(name) for name in session.columns} for view in session.views
     }
     owners, pairs = {number: number for number in cells}, set[frozenset[int]]()
+    named: dict[str, list[str]] = {"images": [], "robot's poses": []}
     for first, second in zip(views[::2], views[1::2], strict=True):
         first_cells, second_cells = cells.get(first, {}), cells.get(second, {})
         differing = [
-            name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
+            name
+            for name in (*_MUST_AGREE, "robot")
+            if first_cells.get(name, "") != second_cells.get(name, "")
         ]
+        are_poses = {*differing} <= {"camera", "target"} and differing != []
         if {first, second} in pairs:
             words = f"Views {first} and {second} must be exchanged once, and are twice."
             raise DataError(words, culprits=["--exchange"])
-        if first == second or differing or not (first_cells and second_cells):
+        is_one_robot = not differing or (are_poses and is_whole_cell(session))
+        if first == second or not (is_one_robot and first_cells and second_cells):
             raise DataError(
                 f"Views {first} and {second} of session {session.name!r} are not two views that "
                 f"see the same{': another ' * bool(differing)}{' and '.join(differing)}.",
                 culprits=["--exchange"],
             )
         pairs.add(frozenset({first, second}))
-        owners[first], owners[second] = owners[second], owners[first]
-        for name in {*_OBSERVED} & {*session.columns}:
+        changed = {*_OBSERVED} & {*session.columns}
+        if are_poses:
+            changed = {*session.columns} - {*_OBSERVED, *_MUST_AGREE, *_OF_ROW}
+        else:
+            owners[first], owners[second] = owners[second], owners[first]
+        for name in changed:
             first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
+        named["robot's poses" if are_poses else "images"].append(f"{first} and {second}")
     corners = session.corner_table
     if corners is not None:
         now = {before: view for view, before in owners.items()}
         moved = [now.get(view, view) for view in corners.views.tolist()]
         corners = replace(corners, views=np.array(moved, dtype=corners.views.dtype))
-    named = ", ".join(
-        f"{first} and {second}" for first, second in zip(views[::2], views[1::2], strict=True)
-    )
-    note = f"the images of views {named} were exchanged"
+    of = listed([f"{what} of views {', '.join(some)}" for what, some in named.items() if some])
+    note = f"the {of} were exchanged"
     return _with_cells(session, cells.values(), note, corners=corners)
 
 
@@ -129,7 +141,7 @@ def shift_views(
         of_robot = _rows_of_one_robot(session, _posed(session, moved) if of_images else moved)
         counted_by = "stop of this robot"
         if not of_images:
-            kept |= {"stop", "robot"}
+            kept |= {*_OF_ROW}
             # Other rows of these stops have no pose of their own to be given another one.
             moved &= {rows[at].number for at in of_robot}
     order = [*dict.fromkeys(stops[at] for at in of_robot)]
