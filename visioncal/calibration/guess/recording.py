@@ -124,7 +124,7 @@ class Candidate:
 
     @property
     def rows_apart(self) -> int:
-        """By how many rows later each view's pose stands, where nothing else is read otherwise."""
+        """Rows by which all views' poses stand later, where nothing else is read otherwise."""
         found, declared = self.hypothesis, self.recording.declared
         by = int(found.rows(FEWEST_ROWS)[1]) - 1
         return by if replace(found, order="", changes=(), cost=0) == declared else 0
