@@ -262,12 +262,15 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
     while True:
         while (lesser := arm.without_least_likely(best)) is not None:
             arm, best = lesser
-        # Residuals have the opposite sign of the errors.
-        negative = best.values[arm.slice_of(COMPLIANCE)] > 0.0 if COMPLIANCE in arm.bases else None
-        if negative is None or not negative.any():
+        if COMPLIANCE not in arm.bases:
+            break
+        bends = arm.bases[COMPLIANCE]
+        # Residuals have the opposite sign of the errors; joints that were left out have rounding.
+        negative = (best.values[arm.slice_of(COMPLIANCE)] > 0.0) & bends.any(axis=(0, 1))
+        if not negative.any():
             break
         # Without joints that would bend upwards, the rest may have no evidence.
-        arm = replace(arm, bases={**arm.bases, COMPLIANCE: arm.bases[COMPLIANCE] * ~negative})
+        arm = replace(arm, bases={**arm.bases, COMPLIANCE: bends * ~negative})
         best = arm.most_likely(best.logs)
     count, gain = arm.nominal.before.size, arm.gain(best)
     if gain <= SIGNIFICANT:
