@@ -13,7 +13,7 @@ from visioncal.robot.arm_model import COMPLIANCE
 
 def likelihood(sigma: float, gain: float) -> SimpleNamespace:
     """Likelihood of one robot at 20 stops that prefers errors of its links of a size."""
-    beside = SimpleNamespace(
+    extended = SimpleNamespace(
         most_likely=lambda start, *_: (
             (np.array([1e-4, 1e-4, sigma]), -0.5 * gain)
             if start[-1] == 0.1
@@ -27,7 +27,7 @@ def likelihood(sigma: float, gain: float) -> SimpleNamespace:
         white=(np.array([1e-4, 1e-4]), 0.0),
         moved=lambda *_: np.zeros((20, 6, 4)),
         start_beside=lambda *_: np.array([1e-4, 1e-4, 0.1]),
-        beside=lambda *_: beside,
+        with_moves=lambda *_: extended,
     )
 
 
