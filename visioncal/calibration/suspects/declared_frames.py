@@ -38,9 +38,9 @@ def carried(run: RunState) -> Iterator[Finding]:
             fixed[row.seer, row.seen] |= {view: run.poses[view] for view in seen}
     for (seer, seen_frame), poses in fixed.items():
         for robot in run.robots:
-            there = _poses_at(run, robot, poses)
+            flanges = _poses_at(run, robot, poses)
             for frame, mount in zip((seer, seen_frame), MOUNTS, strict=True):
-                found = chain_fit(there, poses, mount)
+                found = chain_fit(flanges, poses, mount)
                 if found is not None and found.closes:
                     yield _declared_elsewhere(
                         frame,

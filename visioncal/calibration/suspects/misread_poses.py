@@ -176,11 +176,11 @@ def _is_of_images(
     if found.kind != "shifted_rows":
         return False
     stops = {view.number: stop_of(view) for view in run.session.views}
-    there = {stops[view] for view in found.views}
+    apart_stops = {stops[view] for view in found.views}
     others = [
         mistake is not None and mistake.found.kind == found.kind
         for one, mistake in every
-        if one.camera != pair.camera and there & {stops[view] for view in one.poses}
+        if one.camera != pair.camera and apart_stops & {stops[view] for view in one.poses}
     ]
     return bool(others) and not any(others)
 
@@ -232,9 +232,9 @@ def _rows_apart(run: RunState, by: int, cell: RunState, robot: str) -> Remedy:
     """Advice to give all views of a pair of a cell the poses of rows before or after."""
     views = [view.number for view in run.session.views]
     order = [*dict.fromkeys(stop_of(view) for view in rows_of_robot(cell.session, robot))]
-    own = {view.number: stop_of(view) for view in cell.session.views}
+    stops = {view.number: stop_of(view) for view in cell.session.views}
     # Rows are counted by the robot's stops, of which the pair may show every other one.
-    steps = {*np.diff([order.index(own[view]) for view in views if own[view] in order]).tolist()}
+    steps = {*np.diff([order.index(stops[view]) for view in views if stops[view] in order]).tolist()}
     if not by or len(steps) != 1 or any(len(at.robots) > 1 for at in cell.session.observations):
         return BY_HAND
     return mending("each has its own pose", f"--shift {ranges(views)}:{by * steps.pop()}")
