@@ -234,7 +234,9 @@ def _rows_apart(run: RunState, by: int, cell: RunState, robot: str) -> Remedy:
     order = [*dict.fromkeys(stop_of(view) for view in rows_of_robot(cell.session, robot))]
     stops = {view.number: stop_of(view) for view in cell.session.views}
     # Rows are counted by the robot's stops, of which the pair may show every other one.
-    steps = {*np.diff([order.index(stops[view]) for view in views if stops[view] in order]).tolist()}
+    steps = {
+        *np.diff([order.index(stops[view]) for view in views if stops[view] in order]).tolist()
+    }
     if not by or len(steps) != 1 or any(len(at.robots) > 1 for at in cell.session.observations):
         return BY_HAND
     return mending("each has its own pose", f"--shift {ranges(views)}:{by * steps.pop()}")

@@ -162,8 +162,8 @@ def shift_views(
             {name: (view if name in kept else rows[source]).cell(name) for name in session.columns}
         )
     lost = f"; {ranges(dropped)} had none there and were dropped" if dropped else ""
-    whose = "are" if of_images else "have the robot's poses"
-    note = f"views {ranges(moved)} {whose} of the {counted_by} {by:+d}{lost}"
+    verb = "are" if of_images else "have the robot's poses"
+    note = f"views {ranges(moved)} {verb} of the {counted_by} {by:+d}{lost}"
     corners = session.corner_table
     if corners is not None:
         corners = corners.of_views([view.number for view in rows if view.number not in dropped])
