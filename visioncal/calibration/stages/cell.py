@@ -208,6 +208,11 @@ def stop_of(view: View) -> int:
     return view.number if view.stop is None else view.stop
 
 
+def stops_by_view(session: Session) -> dict[int, int]:
+    """Number of each row's stop, by its view; see `stop_of`."""
+    return {view.number: stop_of(view) for view in session.views}
+
+
 def rows_of_robot(session: Session, robot: str) -> list[View]:
     """The rows with the state of a robot, by its name in a session."""
     declaration = session.declaration

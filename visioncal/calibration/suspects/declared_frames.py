@@ -9,7 +9,7 @@ from visioncal.calibration.guess.fit import is_about_one_axis
 from visioncal.calibration.guess.recording import FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import chain_fit
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cell import stop_of
+from visioncal.calibration.stages.cell import stops_by_view
 from visioncal.calibration.stages.robots import CameraTargetPair
 from visioncal.core.number_format import robot_words
 from visioncal.core.types import MOUNTS, FloatArray
@@ -21,7 +21,7 @@ from visioncal.vision.pnp import ViewPoses
 
 def _poses_at(run: RunState, robot: str, views: Iterable[int]) -> dict[int, FloatArray]:
     """(4, 4) poses of a robot at the stops of some views; empty where it hardly turned there."""
-    stops = {view.number: stop_of(view) for view in run.session.views}
+    stops = stops_by_view(run.session)
     by_stop = {stops[view]: pose for view, pose in run.robots[robot].base_from_flange.items()}
     poses = {view: by_stop[stops[view]] for view in views if stops[view] in by_stop}
     # A robot that waited, or turned about one axis, agrees with much.

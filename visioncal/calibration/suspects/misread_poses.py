@@ -21,7 +21,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import exchanged_columns
-from visioncal.calibration.stages.cell import rows_of_robot, stop_of
+from visioncal.calibration.stages.cell import rows_of_robot, stop_of, stops_by_view
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -175,7 +175,7 @@ def _is_of_images(
     """Whether the images of a pair's camera are rows apart, as others fit the poses there."""
     if found.kind != "shifted_rows":
         return False
-    stops = {view.number: stop_of(view) for view in run.session.views}
+    stops = stops_by_view(run.session)
     apart_stops = {stops[view] for view in found.views}
     others = [
         mistake is not None and mistake.found.kind == found.kind
@@ -232,7 +232,7 @@ def _rows_apart(run: RunState, by: int, cell: RunState, robot: str) -> Remedy:
     """Advice to give all views of a pair of a cell the poses of rows before or after."""
     views = [view.number for view in run.session.views]
     order = [*dict.fromkeys(stop_of(view) for view in rows_of_robot(cell.session, robot))]
-    stops = {view.number: stop_of(view) for view in cell.session.views}
+    stops = stops_by_view(cell.session)
     # Rows are counted by the robot's stops, of which the pair may show every other one.
     steps = {
         *np.diff([order.index(stops[view]) for view in views if stops[view] in order]).tolist()

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.calibration.guess.recording import FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import of_pair
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cell import rows_of_robot, stop_of
+from visioncal.calibration.stages.cell import rows_of_robot, stop_of, stops_by_view
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.moved_views import (
     IN_MOTION,
@@ -180,7 +180,7 @@ def _tool_switched(
     Each pair leaves out the views with the tool, or those without it: then its tool is the inverse.
     """
     tools = [_tool_of(cause) for _, cause in found]
-    stops = {view.number: stop_of(view) for view in run.session.views}
+    stops = stops_by_view(run.session)
     active, idle = set[int](), set[int]()
     for (one, cause), tool in zip(found, tools, strict=True):
         if tool is None or tools[0] is None:
