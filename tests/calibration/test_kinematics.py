@@ -81,7 +81,7 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
         ERROR_RAD,
         np.arange(len(q)),
         q,
-        Loads.none(len(q)),
+        Loads.alike(len(q), 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
         np.zeros(3),
         np.arange(12),
         np.ones(6, dtype=bool),

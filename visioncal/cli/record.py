@@ -80,7 +80,7 @@ def record_command(options: RecordOptions) -> None:
             report_departure(motion_summary(cell, driven, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
-        consent = Consent.of("record", typed_line, yes=options.yes or not drives)
+        consent = Consent.of(typed_line, yes=options.yes or not drives)
         start = Journal.resume if options.resume else Journal.begin
         count = options.views if driven is None else len(driven.stops)
         facts = CaptureFacts.of(cell, options.out.name, recorded, plan)

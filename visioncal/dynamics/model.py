@@ -1,7 +1,6 @@
 """Joint motions, and the torques of links, friction and rotors, linear in the parameters."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -123,12 +122,6 @@ class Friction:
     breaking: FloatArray  # (n,) Fs, breakaway torque in excess of `coulomb` [N m].
     breaking_rad_s: FloatArray  # (n,) vs, Stribeck speed [rad/s].
     slow_rad_s: float = SLOW_RAD_S  # See `sign`.
-
-    @classmethod
-    def none(cls, joints: int) -> Self:
-        """No friction at all."""
-        nothing = np.zeros(joints)
-        return cls(nothing, nothing, nothing, nothing, nothing, np.ones(joints))
 
     def torques(self, dq: FloatArray, ddq: FloatArray) -> FloatArray:
         """Torques (m, n) at (m, n) speeds and accelerations [N m]."""

@@ -47,17 +47,6 @@ class Score:
     information: FloatArray  # (c, c) A'P A.
     freedom: float  # Of the residuals by which noise is known; infinite where it is.
 
-    def gain(self, sigmas: FloatArray) -> float:
-        """Log Bayes factor of values with (c,) standard deviations, against none.
-
-        The level of the noise is integrated out: found without the columns, it is too large where
-        they act.
-        """
-        pull = sigmas * self.pull
-        within = np.eye(len(pull)) + np.outer(sigmas, sigmas) * self.information
-        square = float(pull @ np.linalg.solve(within, pull))
-        return float(self._student(square) - 0.5 * np.linalg.slogdet(within)[1])
-
     def best(self, sigmas: FloatArray, low: float, high: float) -> tuple[float, float]:
         """The most likely of some sizes of columns with (c,) relative sigmas, and its gain."""
         # Columns of a millionth of the variance of others add nothing to see.

@@ -260,8 +260,6 @@ def pick_jacobian(
     q: FloatArray,
     recorded: RecordedStops | None,
     size: int,
-    *,
-    estimates_lens: bool,
 ) -> FloatArray:
     """Jacobian (k, 6, p) of things that the camera sees where stops see the board's middle.
 
@@ -270,7 +268,6 @@ def pick_jacobian(
         q: (k, n) joint angles of the stops [rad].
         recorded: Stops that were recorded already.
         size: Number p of the unknowns.
-        estimates_lens: Whether the stops determine the lens, too.
 
     Returns:
         By the unknowns, of rotation [rad] and position [m], in the axes of what carries the camera:
@@ -279,7 +276,7 @@ def pick_jacobian(
     poses, middle = cell.cam_from_target(q), corner_positions(cell.target).mean(axis=0)
     points, jacobian = (poses @ [*middle, 1.0])[:, :3], np.zeros((len(q), 6, size))
     jacobian[:, :, :6] = adjoint(compose(np.eye(3), -points))
-    free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
+    free = parameters_of(cell, recorded, estimates_lens=True)
     lens = np.flatnonzero(free.columns < len(intrinsics(free.appearance.camera)))
     stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
     if len(lens) and seen.any():

@@ -55,7 +55,7 @@ class Picking:
         sights = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
             size = len(world.prior)
-            jacobian = pick_jacobian(cell, q, self.recorded, size, estimates_lens=True)
+            jacobian = pick_jacobian(cell, q, self.recorded, size)
             # In the axes of what carries the camera: the flange, or the base.
             levels = cell.noise.robots[0][:, None] ** 2 * np.repeat(np.eye(2), 3, axis=1)
             covariances = np.tile((levels[:, None] * np.eye(6))[:, None], (1, len(q), 1, 1))

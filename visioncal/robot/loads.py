@@ -52,11 +52,6 @@ class Loads:
     side: FloatArray
 
     @classmethod
-    def none(cls, count: int) -> Self:
-        """No loads but the arm's own weight."""
-        return cls.alike(count, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-
-    @classmethod
     @typed
     def alike(
         cls,

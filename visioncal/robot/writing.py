@@ -29,10 +29,10 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _LEVER_M = 0.3
 
 
-def table_toml(table: DHTable, source: str, notes: Sequence[str] = ()) -> str:
+def table_toml(table: DHTable, notes: Sequence[str]) -> str:
     """Writes a joint table, with origin and notes, as a `.toml` that `load_robot` reads."""
     head = "".join(f"# {one_line(note)}\n" for note in notes)
-    return head + tomli_w.dumps(table_document(table, source))
+    return head + tomli_w.dumps(table_document(table, "visioncal"))
 
 
 def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:

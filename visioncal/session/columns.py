@@ -168,8 +168,8 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
             )
 
 
-def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
-    """Warnings of unknown columns that look like misspelt known ones."""
+def column_warnings(columns: Sequence[str]) -> Iterator[str]:
+    """Warnings of unknown columns of a views.csv that look like misspelt known ones."""
     known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
     for name in columns:
         # A known word with a suffix, as target_id, is not misspelt.
@@ -177,4 +177,4 @@ def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
         in_radians = name.replace("_deg", "_rad")
         # The similarity of `status` and `stamp_s` is 0.62.
         if hint := "" if is_other else did_you_mean(in_radians, known, 0.76):
-            yield f"{where}: column {name} is not a known one and is kept as text. {hint}"
+            yield f"views.csv: column {name} is not a known one and is kept as text. {hint}"

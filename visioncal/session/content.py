@@ -129,7 +129,7 @@ class SessionContent:
         check_images_can_be_used(declaration, views)
         warnings = [
             *declaration_warnings(declaration),
-            *cols.column_warnings(columns, "views.csv"),
+            *cols.column_warnings(columns),
             *target_warnings(declaration, target_document),
         ]
         check_kinds_named(declaration, views)

@@ -66,13 +66,14 @@ class Warming:
         return Stream(("stamp_s", *names, "ambient_c"), np.hstack(columns)[kept])
 
 
-def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) -> Warming:
-    """Temperatures of an arm that starts cold and works for some hours, in steps of `step_s`.
+def warm_up(heat: Heat, hours: float, *, seed: int) -> Warming:
+    """Temperatures of an arm that starts cold and works for some hours, in steps of 10 s.
 
     The duty varies by a quarter between pieces of work.
     """
-    if min(hours, step_s) <= 0.0:
-        raise DataError("simulation: a warm-up needs a time and a step above 0.")
+    if hours <= 0.0:
+        raise DataError("simulation: a warm-up needs a time above 0.")
+    step_s = 10.0
     rng = np.random.default_rng([98, seed])
     stamps = np.arange(0.0, 3600.0 * hours + step_s, step_s)
     pieces = np.exp(0.25 * rng.standard_normal((len(stamps) // 30 + 1, JOINTS)))

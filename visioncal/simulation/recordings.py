@@ -283,7 +283,7 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
     pools = [rng.permutation(group).tolist() for group in groups.values() if len(group) > 1]
     wrong: list[int] = []
     for _ in range(layout.swapped_rows):
-        pool = _pool(pools, 2)
+        pool = _pool(pools)
         first, second = pool.pop(), pool.pop()
         sights[first], sights[second] = (
             _showing(cell.sights[first], cell.sights[second]),
@@ -292,7 +292,7 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
         wrong += [first, second]
     for _ in range(layout.stray_images):
         rng.shuffle(pools)
-        pool = _pool(pools, 2)
+        pool = _pool(pools)
         row = pool.pop()
         sights[row] = _showing(cell.sights[row], cell.sights[pool[0]])
         wrong.append(row)
@@ -300,9 +300,9 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
     return replace(cell, sights=tuple(sights), wrong_views=tuple(views))
 
 
-def _pool(pools: list[list[int]], least: int) -> list[int]:
+def _pool(pools: list[list[int]]) -> list[int]:
     for pool in pools:
-        if len(pool) >= least:
+        if len(pool) >= 2:
             return pool
     raise DataError("simulation: there are too few rows of one camera and board for such faults.")
 

@@ -94,7 +94,7 @@ def _not_used(run: RunState) -> Iterator[Finding]:
 def _suspicious(session: Session) -> Iterator[Finding]:
     """Findings on what was suspicious in the session's files, with remedies where known."""
     # A column that may be misspelt, or the user's own.
-    of_columns = [*column_warnings(session.columns, "views.csv")]
+    of_columns = [*column_warnings(session.columns)]
     for warning in session.warnings:
         if _OF_MODEL.match(warning):
             yield Finding("misread_joints", warning, Remedy(_MODEL_STEP))

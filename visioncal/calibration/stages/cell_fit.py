@@ -113,12 +113,8 @@ class CellFit:
         """The problem of the inliers, repeated ones sharing an error."""
         return replace(self.full_problem(seen), with_repeats=True).subset(self.inlier_fit.used)
 
-    def rows(self, seen: LinearisedCorners) -> IntArray:
-        """(n,) index of the corners' view of each observation of `problem`; -1 for none."""
-        return self.all_rows(seen)[self.inlier_fit.used]
-
     def all_rows(self, seen: LinearisedCorners) -> IntArray:
-        """(n,) the same of all observations."""
+        """(n,) index of the corners' view of each observation of the cell; -1 for none."""
         places = {view: at for at, view in enumerate(seen.views)}
         return np.array([places.get(row.view, -1) for row in self.cell.rows], dtype=np.int64)
 

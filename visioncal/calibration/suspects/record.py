@@ -147,7 +147,7 @@ class Edges:
     lever: float
 
     @classmethod
-    def by(cls, record: Record, pairs: IntArray, among: Mask, starts: int = _STARTS) -> Self | None:
+    def by(cls, record: Record, pairs: IntArray, among: Mask) -> Self | None:
         """The edges that most of some paired rows agree on; None with too few."""
         some = np.flatnonzero(among & (pairs >= 0))
         if len(some) < FEWEST_COMPARED:
@@ -157,9 +157,9 @@ class Edges:
         robot, seen = record.robot[pairs[some]][None], record.camera[some, 0]
         if record.are_places:
             # Of a reading, the chain is that of the point on the flange.
-            fit = mounting_fits(invert(robot), seen[:, :3, 3], starts, _KEPT, _WINDOW)[0]
+            fit = mounting_fits(invert(robot), seen[:, :3, 3], _STARTS, _KEPT, _WINDOW)[0]
             return cls(record, fit.z, fit.x, fit.lever)
-        fit = robust_fits(robot, seen[None], starts, share=_KEPT)[0]
+        fit = robust_fits(robot, seen[None], _STARTS, share=_KEPT)[0]
         return cls(record, fit.x, fit.z, fit.lever)
 
     def turned(self, pairs: IntArray) -> FloatArray:

@@ -195,9 +195,9 @@ class DocumentTable:
         """Reads a string."""
         return str(self.read(key, str, default))
 
-    def flag(self, key: str, default: bool) -> bool:
-        """Reads true or false."""
-        return bool(self.read(key, bool, default))
+    def flag(self, key: str) -> bool:
+        """Reads true or false, which is the default."""
+        return bool(self.read(key, bool, False))
 
     def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
         """Reads one of several strings."""

@@ -192,11 +192,6 @@ class LinearisedCorners:
         return np.isin(self.free, self.camera_parameters.held)
 
     @property
-    def moving(self) -> IntArray:
-        """Indices of the values that a fit moves."""
-        return self.free[~self.held]
-
-    @property
     def known(self) -> PriorInformation:
         """Information on the free values from corners and priors, without any robot."""
         optics, free = self.camera_parameters, self.free

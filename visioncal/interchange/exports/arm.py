@@ -229,7 +229,7 @@ ARMS = (
         "robot-dh",
         "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati "
         "[m, rad]",
-        lambda content: table_toml(content.table, "visioncal", content.notes),
+        lambda content: table_toml(content.table, content.notes),
         takes=frozenset({"convention"}),
     ),
     ArmFormat(

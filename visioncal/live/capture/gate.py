@@ -41,12 +41,11 @@ class Consent:
     ask: Callable[[str], str] | None
 
     @classmethod
-    def of(cls, command: str, ask: Callable[[str], str], *, yes: bool) -> Self:
-        """How a command gets consent; raises DataError."""
+    def of(cls, ask: Callable[[str], str], *, yes: bool) -> Self:
+        """How `record` gets consent; raises DataError."""
         if not (yes or sys.stdin.isatty()):
             raise DataError(
-                f"{command}: nobody can be asked whether the arm may move, as stdin is not a "
-                "terminal.",
+                "record: nobody can be asked whether the arm may move, as stdin is not a terminal.",
                 culprits=["--yes"],
                 next_step="Give --yes where the cell is clear and somebody holds the stop button.",
             )

@@ -60,7 +60,7 @@ class Charuco(Board):
         dictionary = table.text("dictionary")
         size = f"{columns} x {rows} squares"
         first = first_id(table, columns * rows // 2, size, dictionary)
-        legacy = table.flag("legacy", default=False)
+        legacy = table.flag("legacy")
         board = Target(
             name, self.name, columns, rows, square_m, sigma_m, marker_m, dictionary, legacy
         )

@@ -72,7 +72,7 @@ class CircleGrid(Board):
         """
         columns, rows = counts_of(table)
         square_m = size_of(table, "square_m")
-        asymmetric = table.flag("asymmetric", default=False)
+        asymmetric = table.flag("asymmetric")
         # Distance of the nearest circles.
         spacing_m = square_m * np.sqrt(2.0) if asymmetric else square_m
         diameter_m = table.number("diameter_m", _USUAL_DIAMETER * spacing_m, positive=True)

@@ -88,7 +88,7 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
     """
     pictures = [images] if isinstance(images, np.ndarray) else [*images]
     for picture in pictures:
-        check_grey(picture, "image")
+        check_grey(picture)
     sets = [pictures]
     if max(picture.size for picture in pictures) > _MANY_PX:
         small = [resized(each, min((_ENOUGH_PX / each.size) ** 0.5, 1.0)) for each in pictures]

@@ -96,12 +96,12 @@ def faint_jpeg(image: Image) -> bytes:
     return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 20])[1])
 
 
-def check_grey(image: Image, label: str) -> None:
+def check_grey(image: Image) -> None:
     """Checks that an image is grey; raises DataError."""
     if image.ndim != 2:
         raise DataError(
-            f"{label} has the shape {image.shape}, but must have (h, w), of grey levels.",
-            culprits=[label],
+            f"image has the shape {image.shape}, but must have (h, w), of grey levels.",
+            culprits=["image"],
             next_step=GREY,
         )
 
