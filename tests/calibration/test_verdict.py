@@ -173,10 +173,12 @@ def test_another_size_is_reported_under_the_key_of_the_targets_file(name, said) 
     assert said in found.words
     assert "--board-scale left:1.0047 " in found.do.command
     # By so little, an arm may err as well; by more, none does.
-    assert "the board is as stated, and the arm goes 0.47 % less far than it reports" in found.words
+    rival = "the board is as stated, and the arm goes 0.47 % less far than it reports"
+    assert found.rivals == (rival,)
+    assert found.in_words().words == f"{found.words}{LEFT_OPEN} {rival}."
     larger = replace(MEASURED, scale=9e-3)
     found = scale_finding("board", load_target(name), larger, larger, "left")
-    assert LEFT_OPEN not in found.words
+    assert not found.rivals
     assert "if the board is right, the arm's model is off by as much" in found.words
 
 

@@ -21,6 +21,7 @@ from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.board_points import with_board_points
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import misreadings, with_open_chains
 from visioncal.calibration.suspects.pairs_alone import found_alone, is_open, pairs_alone
 from visioncal.core.arguments import typed
@@ -218,13 +219,14 @@ def misread_poses(state: RunState) -> Iterator[Finding]:
     yield from misreadings(state)
 
 
-def _explained_by_pairs(error: VisioncalError, state: RunState) -> VisioncalError:
-    """The error of a whole cell with the first cause that a pair of it shows alone."""
+def _explained_by_pairs(error: VisioncalError, state: RunState) -> VisioncalError | None:
+    """The error of a whole cell by the first cause that a pair of it shows alone."""
     every = [] if state.mount is not None else pairs_alone(state, partial(_of_pair, state))
     for found in found_alone(state, every):
         culprits = [f"view {view}" for view in found.views] or error.culprits
-        return type(error)(found.words, culprits=culprits, next_step=str(found.do or ""))
-    return error
+        words = found.in_words().words
+        return type(error)(words, culprits=culprits, next_step=str(found.do or ""))
+    return None
 
 
 def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
@@ -236,13 +238,16 @@ def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
                 state.progress(stage.name, index, len(stages))
             try:
                 state = stage.run(state)
+            except OtherBoardError:
+                raise
             except VisioncalError as error:
-                likely = explained(error, state, stage.name, are_located=are_located)
-                if likely.message == error.message and stage.name in ("solve", "examine"):
-                    likely = _explained_by_pairs(likely, state)
-                if likely is error:
-                    raise
-                raise likely from error
+                # Lost views are often why the remaining ones do not suffice.
+                lost = [view for view in state.lost_views if view not in error.culprits]
+                fault = error.with_culprits(lost)
+                likely = explained(fault, state, stage.name, are_located=are_located)
+                if likely is None and stage.name in ("solve", "examine"):
+                    likely = _explained_by_pairs(fault, state)
+                raise likely or fault from error
             if stage.name == "joints":
                 state, are_located = with_open_chains(state), True
         return state

@@ -12,6 +12,7 @@ import numpy as np
 from visioncal.core.codec import DROPPED, UNWRITTEN
 from visioncal.core.number_format import percent, ranges
 from visioncal.core.summaries import html_card
+from visioncal.core.types import FloatArray
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 
@@ -33,7 +34,8 @@ DEPTH_CHANGED = "depth_changed"
 CALIBRATE, ADD_VIEWS = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add"
 PLAN = f"{ADD_VIEWS} 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
-GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
+CALIBRATE_FIXED = "visioncal calibrate FIXED -o OUT"
+GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE_FIXED}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 _BY_HAND = "Of several robots or cameras, correct the files by hand."
@@ -41,6 +43,21 @@ _BY_HAND = "Of several robots or cameras, correct the files by hand."
 AGAIN = "AGAIN"
 # After a calibration's output stands the need that was typed.
 _PATH = re.compile(r"-o (?:OUT|NEW)\b|\b(?:SESSION|FIXED|OUT|NEW|AGAIN)\b")
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a remedy's command."""
+
+    name: str  # Without dashes.
+    value: str = ""  # Its value; empty for none.
+    views: tuple[int, ...] = ()  # The views that it is for; empty for all.
+    # (4, 4) the tool that it takes off poses, in the flange.
+    tool: FloatArray | None = field(default=None, compare=False)
+
+    def __str__(self) -> str:
+        words = ":".join(filter(None, [ranges(self.views), self.value]))
+        return f"--{self.name} {words}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -52,6 +69,10 @@ class Remedy:
     # SESSION, FIXED (a corrected copy of the session), OUT, NEW (beside OUT) and AGAIN (the typed
     # command).
     command: Annotated[str, DROPPED] = ""
+    # The option of the command that is for some rows; without a name for none.
+    option: Annotated[Option, UNWRITTEN] = field(default=Option(""), compare=False)
+    # Its words without the command, where these are others.
+    plain: Annotated[str, UNWRITTEN] = field(default="", compare=False)
 
     def __str__(self) -> str:
         is_shown = self.command and AGAIN not in self.command
@@ -59,11 +80,16 @@ class Remedy:
 
     def of_cell(self, robots: int, cameras: int) -> "Remedy":
         """The remedy for some robots and cameras: by hand where its command is for all of many."""
-        if "--intrinsics" in self.command and cameras > 1:
+        if self.option.name == "intrinsics" and cameras > 1:
             by_hand = 'Of several cameras, write intrinsics = "refine" in the table of this one.'
             return Remedy(f"{self.words} {by_hand}")
-        is_of_all = "--by-joints" in self.command and robots > 1
+        is_of_all = self.option.name == "by-joints" and robots > 1
         return Remedy(f"{self.words} {_BY_HAND}") if is_of_all else self
+
+    def by(self, option: Option) -> "Remedy":
+        """The same words with the command that calibrates a copy by an option of `convert`."""
+        command = f"visioncal convert SESSION FIXED {option} && {CALIBRATE_FIXED}"
+        return replace(self, command=command, option=option)
 
 
 def look_at(view: int) -> str:
@@ -71,17 +97,17 @@ def look_at(view: int) -> str:
     return f"{REVIEW} --view {view}"
 
 
-def mending(words: str, option: str) -> Remedy:
+def mending(words: str, option: Option, first: str = "", end: str = ".") -> Remedy:
     """Advice to write a copy of the session with an option of `convert`, and to calibrate it."""
-    fixed = CALIBRATE.replace("SESSION", "FIXED")
-    words = f"Write a copy of the session in which {words}, and calibrate it."
-    return Remedy(words, f"visioncal convert SESSION FIXED {option} && {fixed}")
+    write = f"{first}write" if first else "Write"
+    words = f"{write} a copy of the session in which {words}, and calibrate it{end}"
+    return Remedy(words).by(option)
 
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:
     """Advice with the command to calibrate some views alone, if they are enough."""
-    are_enough = len(views) >= 6
-    return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if are_enough else "")
+    option = Option("views", views=tuple(views))
+    return Remedy(words, f"{CALIBRATE_ANEW} {option}", option) if len(views) >= 6 else Remedy(words)
 
 
 def without(views: Sequence[int], residuals: str) -> str:
@@ -129,12 +155,22 @@ class Finding:
     is_apart: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
     # Greatest error of a pick that it causes [mm]; infinite where unknown.
     up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
+    # Parts of its text that follow its words, until `in_words`: what the result makes of it, as a
+    # sentence; and what explains about as much, as clauses.
+    consequence: Annotated[str, UNWRITTEN] = field(default="", compare=False)
+    rivals: Annotated[tuple[str, ...], UNWRITTEN] = field(default=(), compare=False)
 
     def of(self, name: str) -> Self:
         """The same finding prefixed by the name of its camera or robot, if not empty."""
         if not name:
             return self
         return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
+
+    def in_words(self) -> Self:
+        """The same finding with all parts of its text in its words."""
+        words = " ".join(filter(None, [self.words, self.consequence]))
+        words += f"{LEFT_OPEN} {' or '.join(self.rivals)}." if self.rivals else ""
+        return replace(self, words=words, consequence="", rivals=())
 
     @property
     def reason(self) -> str:

@@ -448,7 +448,7 @@ def to_document(
         },
         "session": {"name": observed.session.name, "sha256": observed.session.digest()},
         "sentences": list(verdict.reasons),
-        "next": [vars(step) for step in verdict.next_steps],
+        "next": [{"words": at.words, "command": at.command} for at in verdict.next_steps],
         "changes": [_change(check, change) for change in check.named],
         "others": [_change(check, change) for change in others],
         "explained": check.explained,

@@ -6,7 +6,6 @@ from visioncal.calibration.pipeline.guess_inputs import closes, guess_from_camer
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.image_checks import unseen_cause
-from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import UNRECORDED, with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.calibration.suspects.suspect import UNDONE
@@ -17,12 +16,8 @@ from visioncal.core.verdict import Remedy, of_cell
 
 def explained(
     error: VisioncalError, state: RunState, stage: str, *, are_located: bool
-) -> VisioncalError:
-    """An error of a stage with its likeliest cause, where known, or the command for more views."""
-    if isinstance(error, OtherBoardError):
-        return error
-    # Lost views are often why the remaining ones do not suffice.
-    error = error.with_culprits([view for view in state.lost_views if view not in error.culprits])
+) -> VisioncalError | None:
+    """An error of a stage by its likeliest cause, or with the command for more views, or None."""
     cause = unseen_cause(state) or (poor_motion(state) if stage == "intrinsics" else None)
     if cause is not None:
         words, step = f"{cause.words} {error.message}", str(cause.do or "")
@@ -33,7 +28,7 @@ def explained(
         words = f"{found.words} {error.message}"
         return type(error)(words, culprits=error.culprits, next_step=str(found.do or ""))
     if is_pair and not are_located:
-        return error
+        return None
     state = with_misreading(state)
     read = state.misread or ()
     for misread in of_cell(read, len(state.robots), len(state.cameras)):
@@ -42,7 +37,7 @@ def explained(
     if isinstance(error, DegenerateError) and (words := _open_chain(state)):
         return DegenerateError(words, next_step=str(UNRECORDED))
     if (plan := more_views(error, state)) is None:
-        return error
+        return None
     return type(error)(error.message, culprits=error.culprits, next_step=str(plan))
 
 

@@ -92,7 +92,7 @@ def result_of(run: RunState) -> Calibration:
         validation=Validation.of(
             answer.held_out.method if was_left_out or is_pair else "", answer.views
         ),
-        verdict=verdict,
+        verdict=replace(verdict, findings=tuple(found.in_words() for found in verdict.findings)),
         boards=boards,
         rigs=rigs,
         cell=cell,

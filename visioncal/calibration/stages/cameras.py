@@ -23,7 +23,7 @@ from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalEr
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import Finding, mending
+from visioncal.core.verdict import Finding, Option, mending
 from visioncal.results import CameraResult
 from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
@@ -45,7 +45,7 @@ _SAME_RATIO = 0.03
 NEW_LENS = mending(
     "the lens is estimated from these views (or calibrate the camera anew, and state its matrix "
     "and distortion)",
-    "--intrinsics estimate",
+    Option("intrinsics", "estimate"),
 )
 # A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
 # the move where stated intrinsics were misread.

@@ -78,8 +78,8 @@ class Cell:
         """
         views = self.views_from(station)
         words = f"{do}, and record again; or calibrate the {len(views)} views after it alone{note}."
-        either = or_alone(words, views)
-        return either if either.command else Remedy(f"{do}, and record again.")
+        either, plain = or_alone(words, views), f"{do}, and record again."
+        return replace(either, plain=plain) if either.command else Remedy(plain)
 
     @property
     def mount(self) -> Mount | None:

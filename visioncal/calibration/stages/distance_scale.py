@@ -1,14 +1,12 @@
 """Scale error of poses that another program measured, by the robot's motion."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from visioncal.calibration.guess.fit import distance_rows
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Remedy, mending
+from visioncal.core.verdict import Finding, Option, Remedy, mending
 
 
 def distance_scale(
@@ -44,10 +42,9 @@ def distance_scale(
 
 def scaling(first: str, factor: float, board: str = "") -> Remedy:
     """Advice to scale a board, of several by its name, after a measurement that comes first."""
-    option = f"--board-scale {f'{board}:' * bool(board)}{factor:.5g}"
-    do = mending(f"the board is {factor:.5g} times as large", option)
-    words = f"{first}{do.words[0].lower()}{do.words[1:-1]}; else check the arm."
-    return replace(do, words=words)
+    option = Option("board-scale", f"{f'{board}:' * bool(board)}{factor:.5g}")
+    words = f"the board is {factor:.5g} times as large"
+    return mending(words, option, first, "; else check the arm.")
 
 
 def other_size(share: float, variance: float, further: str = "") -> Finding:

@@ -7,7 +7,6 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.types import Camera, Corners, FloatArray
-from visioncal.core.verdict import LEFT_OPEN
 from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
@@ -123,11 +122,9 @@ class ErrorSizes:
         values = (one.values for one in camera_effects if one.effect.kind == kind.replace("_", " "))
         return next(values, np.zeros(1))
 
-    def instead_of(self, kind: str) -> str:
-        """The rivals of a kind of effects, as a sentence behind others; empty without any."""
-        words = (EFFECTS[rival].clause for rival in sorted(self.rivals.get(kind, ())))
-        listed = " or ".join(words)
-        return f"{LEFT_OPEN} {listed}." if listed else ""
+    def instead_of(self, kind: str) -> tuple[str, ...]:
+        """The rivals of a kind of effects, as clauses."""
+        return tuple(EFFECTS[rival].clause for rival in sorted(self.rivals.get(kind, ())))
 
 
 def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:

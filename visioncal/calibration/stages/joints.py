@@ -12,7 +12,7 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Remedy, mending
+from visioncal.core.verdict import Finding, Option, Remedy, mending
 from visioncal.robot import Robot
 from visioncal.robot.conversion import with_base
 from visioncal.robot.files import robot_names
@@ -197,7 +197,7 @@ def _report_tool_frame(matched: MatchedJoints, largest: FloatArray) -> MatchedJo
         step = mending(
             "the poses are the flange's by the joint angles, if the flange itself is meant (next "
             "time, set the controller's tool to zero)",
-            "--by-joints",
+            Option("by-joints"),
         )
         warnings.append(Finding("tool_frame", words, step))
     return replace(matched, warnings=tuple(warnings), notes=tuple(notes))

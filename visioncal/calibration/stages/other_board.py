@@ -11,7 +11,7 @@ import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Image, Target
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.core.verdict import CALIBRATE_FIXED, Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.session.kinds import declared_targets
@@ -43,9 +43,7 @@ _PLAIN = 0.75
 # Gaps between markers that differ by less are the same [sides].
 _SAME_SPACING = 0.05
 # Command that writes a copy with the images as they should be, and calibrates it.
-MEND_IMAGES = (
-    f"visioncal convert SESSION FIXED --mend-images && {CALIBRATE.replace('SESSION', 'FIXED')}"
-)
+MEND_IMAGES = f"visioncal convert SESSION FIXED --mend-images && {CALIBRATE_FIXED}"
 # Remedy where some images are turned or scaled.
 MADE_ALIKE = Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES)
 

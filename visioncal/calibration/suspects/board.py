@@ -15,7 +15,7 @@ from visioncal.core.number_format import counted, figure, ranges
 from visioncal.core.quantiles import FALSE_ALARM, SIGMA_PER_MAD, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import Corners, FloatArray, Target
-from visioncal.core.verdict import LEFT_OPEN, NOTE, Finding, Remedy
+from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
     MeasuredScale,
@@ -146,7 +146,7 @@ def scale_finding(
     """
     # Errors that last from stop to stop count in the total alone.
     measured = replace(measured, sigma=max(measured.sigma, written.sigma))
-    share = f"{figure(100 * measured.stated_sigma)} %"
+    share, rivals = f"{figure(100 * measured.stated_sigma)} %", tuple[str, ...]()
     size = (
         f"By the robot's motion the {called} is {figure(100 * abs(written.scale))} % "
         f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
@@ -166,16 +166,17 @@ def scale_finding(
             f"{share}). The result takes the robot's scale"
         )
         if abs(written.scale) <= _ARM_SCALES:
+            percent = f"{figure(100 * abs(written.scale))} %"
             far = "farther" if written.scale < 0 else "less far"
-            words += f".{LEFT_OPEN} the board is as stated, and the arm goes "
-            words += f"{figure(100 * abs(written.scale))} % {far} than it reports."
+            words += "."
+            rivals = (f"the board is as stated, and the arm goes {percent} {far} than it reports",)
         else:
             words += "; if the board is right, the arm's model is off by as much."
         first = "Measure the board over its whole width."
     total = measured.sigma**2 + measured.stated_sigma**2
     square = measured.scale**2 / total
     do = scaling(f"{first} If the robot is right, ", 1 + written.scale, name)
-    return Finding("board_size", words, do, mahalanobis_sq=square)
+    return Finding("board_size", words, do, mahalanobis_sq=square, rivals=rivals)
 
 
 def _stretched(found: Finding, fitted: Fit, board: tuple[str, str], called: str) -> Finding:
@@ -197,6 +198,7 @@ def _stretched(found: Finding, fitted: Fit, board: tuple[str, str], called: str)
             "Print it on another printer, and measure it along both axes; one square_m does "
             "not describe this one, of which the result has both sizes."
         ),
+        rivals=(),
     )
 
 

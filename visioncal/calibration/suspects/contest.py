@@ -20,7 +20,7 @@ from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import LEVER_M, exp
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import LEFT_OPEN, Finding
+from visioncal.core.verdict import Finding
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -90,8 +90,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         if is_apart:
             rest = min(rest, 1.0 - share)
         # Of what no view distinguishes, no cure proves one.
-        is_proven = bool(finding.mahalanobis_sq) and LEFT_OPEN not in finding.words
-        is_proven, instead = is_proven and _proves(run, trial), ""
+        is_proven = bool(finding.mahalanobis_sq) and not finding.rivals
+        is_proven, instead = is_proven and _proves(run, trial), tuple[str, ...]()
         if finding.kind in KINDS:
             # The fit here knows of a lens what the one likelihood of all corners found, which is no
             # rival's: there they were tried.
@@ -107,7 +107,7 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             is_proven &= by_lens < finding.mahalanobis_sq
         yield replace(
             finding,
-            words=finding.words + instead,
+            rivals=(*finding.rivals, *instead),
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
             f"{before}.",
             is_proven=is_proven,
@@ -146,13 +146,13 @@ def _proves(run: RunState, trial: Trial) -> bool:
     return all(step.gain <= gain for step in rivals)
 
 
-def _of_joint(run: RunState, kind: str) -> str:
-    """A joint in place of a linear axis, as a sentence; empty where the joints are known."""
+def _of_joint(run: RunState, kind: str) -> tuple[str, ...]:
+    """A joint in place of a linear axis, as a clause; empty where the joints are known."""
     if not issubclass(KINDS[kind], Stretches) or all(
         arm.is_modelled for arm in run.cell_fit.arms.values()
     ):
-        return ""
-    return f"{LEFT_OPEN} a joint of the arm turns by another share than it reports."
+        return ()
+    return ("a joint of the arm turns by another share than it reports",)
 
 
 def _may_be_of_arm(run: RunState) -> bool:

@@ -46,7 +46,7 @@ def judge(findings: Findings) -> Verdict:
     """
     picks, warnings = findings.picks, list(findings.warnings)
     small = [warning for warning in warnings if is_negligible(warning, picks)]
-    notes = remarks((*findings.notes, *(finding.words for finding in small)), NOTE)
+    notes = remarks((*findings.notes, *(finding.in_words().words for finding in small)), NOTE)
     findings = replace(findings, warnings=[found for found in warnings if found not in small])
     found = collect_findings(findings)
     # Mere effects of what a need judges are judged with it.

@@ -12,7 +12,7 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import view_words
 from visioncal.core.transforms import distances, robot_part
 from visioncal.core.types import MOUNTS
-from visioncal.core.verdict import Finding, Remedy, mending
+from visioncal.core.verdict import Finding, Option, Remedy, mending
 
 _KIND = "late_poses"
 # Poses are those of the joint angles, and of the flange [m, rad].
@@ -20,7 +20,7 @@ _SAME, _ROUNDED = 1e-6, 1e-4
 _BY_JOINTS = mending(
     "the poses are those of the joint angles (next time, log both at one instant, while the arm "
     "stands)",
-    "--by-joints",
+    Option("by-joints"),
 )
 _OF_TIP = Remedy(
     "Write the poses of these rows anew, by their joint angles and the tool of the other rows, or "

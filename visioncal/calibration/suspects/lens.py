@@ -209,10 +209,11 @@ def _beyond(run: RunState) -> Iterator[Finding]:
         elif how:
             yield Finding(
                 "focus",
-                f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
+                f"{of} changes its focal length {' and '.join(how)}.",
                 Remedy("Fix the focus (no autofocus), or work at one distance."),
                 mahalanobis_sq=max(changes),
                 up_to_mm=10.0 * max(percents) * distance_m,
+                consequence="The result counts it.",
             )
 
 
@@ -249,8 +250,8 @@ def _seen_through(run: RunState) -> Iterator[Finding]:
             finding = _sagging(effect, found.values)
         else:
             finding = _swelling(found.values)
-        words = f"{finding.words}{sizes.instead_of(effect.kind)}"
-        finding = replace(finding, words=words, mahalanobis_sq=found.gain)
+        rivals = sizes.instead_of(effect.kind)
+        finding = replace(finding, rivals=rivals, mahalanobis_sq=found.gain)
         yield finding.of("" if camera == ONLY_CAMERA else camera)
 
 
@@ -324,9 +325,10 @@ def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
             words += "rectified in one part alone, or another lens was put on."
             do = cell.or_separately(_ONE_LENS, zoom.station)
         elif np.hypot(*zoom.shift_px) > _SHIFTED_PX and not instead:
+            do = cell.or_separately("Keep one region of interest", zoom.station)
             return _shifted(of, zoom, f"{first}, ", do, gain)
-    words += f" The result counts it as scatter.{instead}"
-    return Finding("focus", words, do, mahalanobis_sq=gain)
+    counts = "The result counts it as scatter."
+    return Finding("focus", words, do, mahalanobis_sq=gain, consequence=counts, rivals=instead)
 
 
 def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Finding:
@@ -337,7 +339,7 @@ def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Findin
         f"{first[0].upper()}{first[1:]}the images are shifted by ({x_px}, {y_px}) px, as where "
         "another part of the sensor is read (a region of interest), or "
         f"{of[0].lower()}{of[1:]} was hit.",
-        replace(do, words=do.words.replace("Fix zoom and focus", "Keep one region of interest")),
+        do,
         mahalanobis_sq=gain,
     )
 

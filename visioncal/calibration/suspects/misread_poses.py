@@ -38,7 +38,7 @@ from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, S
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO
-from visioncal.core.number_format import figure, ranges, robot_words
+from visioncal.core.number_format import figure, robot_words
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import (
@@ -46,6 +46,7 @@ from visioncal.core.verdict import (
     CALIBRATE,
     READ_AGAIN,
     Finding,
+    Option,
     Remedy,
     mending,
     or_alone,
@@ -150,7 +151,7 @@ def with_undone(run: RunState) -> RunState:
                 f"{subject[0].upper()}{subject[1:]}, in its rows of {pair.camera} and {pair.target}"
             )
             found, do = mistake.found, mistake.found.do
-            if do is not None and "--views" in do.command:
+            if do is not None and do.option.name == "views":
                 # The other views are those of all pairs.
                 others = [at.number for at in run.session.views if at.number not in found.views]
                 do = or_alone(do.words, others)
@@ -239,7 +240,7 @@ def _rows_apart(run: RunState, by: int, cell: RunState, robot: str) -> Remedy:
     }
     if not by or len(steps) != 1 or any(len(at.robots) > 1 for at in cell.session.observations):
         return BY_HAND
-    return mending("each has its own pose", f"--shift {ranges(views)}:{by * steps.pop()}")
+    return mending("each has its own pose", Option("shift", f"{by * steps.pop()}", tuple(views)))
 
 
 def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) -> Iterator[Finding]:
@@ -273,8 +274,9 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
     elif guess.is_open:
         step = Remedy(_WHICH)
         if guess.positions:
-            every = ranges([view.number for view in run.session.views])
-            step = mending("positions are read otherwise", f"--positions {every}:{guess.positions}")
+            every = tuple(view.number for view in run.session.views)
+            option = Option("positions", guess.positions, every)
+            step = mending("positions are read otherwise", option)
             step = replace(step, words=f"{_WHICH} Where the positions are wrong: {step.words}")
         yield Finding("misread_poses", guess.sentence, step)
     yield from unknown

@@ -8,10 +8,10 @@ from visioncal.calibration.guess.fit import distance_rows, robust_fits
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimits
-from visioncal.core.number_format import figure, ranges
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import robot_part
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending
+from visioncal.core.verdict import CALIBRATE, Finding, Option, Remedy, mending
 from visioncal.estimation.observability import too_little_motion
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 
@@ -76,7 +76,7 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
         yield Finding("misread_poses", words, Remedy(f"{step} Calibrate again.", CALIBRATE))
         return
     by_view = dict(zip(views.tolist(), motion.tolist(), strict=True))
-    every = ranges([view.number for view in run.session.views])
+    every = tuple(view.number for view in run.session.views)
     for _, factor in _columns(run, by_view, away_m, [POSE[axis]] if is_axis else []):
         share = 1.0 + factor
         if (unit := _unit_of(share)) != "m" and abs(np.log(abs(share))) > _UNIT:
@@ -89,7 +89,7 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
                 f"{figure(1e3 * away_m)} mm."
             )
             mended = (f"{size:g}*{at}" if at == name else at for at in "xyz")
-            do = mending("all of them are in m", f"--positions {every}:{','.join(mended)}")
+            do = mending("all of them are in m", Option("positions", ",".join(mended), every))
             yield Finding("misread_poses", words, do)
             return
     # Columns that no stage reads.
@@ -103,7 +103,7 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
             for at, part in zip("xyz", np.round(direction, 3 if not is_axis else 0), strict=True)
         )
         words += f" Column {column} of views.csv has it."
-        do = mending("it is added to the positions", f"--positions {every}:{terms}")
+        do = mending("it is added to the positions", Option("positions", terms, every))
         break
     yield Finding("misread_poses", words, do)
 

@@ -12,10 +12,10 @@ from visioncal.calibration.guess.recording import EVIDENCE
 from visioncal.calibration.suspects.record import LEAST, Edges, Record, evidence
 from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.number_format import counted, ranges, some_of, view_words
+from visioncal.core.number_format import counted, some_of, view_words
 from visioncal.core.transforms import apply, compose, exp, invert, robot_part, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import Finding, mending, or_alone
+from visioncal.core.verdict import Finding, Option, mending, or_alone
 
 # Rows that images and poses are apart, from none on: some lost or doubled pictures.
 SHIFTS = (0, *(sign * by for by in range(1, 7) for sign in (1, -1)))
@@ -145,7 +145,7 @@ def other_signs(
                 "lost_sign",
                 f"In {view_words(views)} {short}: with its own, they agree with the others. They "
                 "were left out.",
-                mending("it has its own", f"--positions {ranges(views)}:{axes}"),
+                mending("it has its own", Option("positions", axes, views)),
                 views,
             ),
             short,
@@ -180,7 +180,7 @@ def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[U
                 "mixed_units",
                 f"In {view_words(views)} {short}: in the same one, they agree with the others. "
                 "They were left out.",
-                mending("all have one unit", f"--positions {ranges(views)}:{axes}"),
+                mending("all have one unit", Option("positions", axes, views)),
                 views,
             ),
             short,
@@ -287,7 +287,7 @@ def turned_rows(
             Finding(
                 "turned_board",
                 f"In {view_words(views)} {short} {where} {point}. They were left out.",
-                mending(back, f"--turned {ranges(views)}:{about}"),
+                mending(back, Option("turned", about, views)),
                 views,
             ),
             short,
@@ -385,7 +385,7 @@ def rows_apart(
             "shifted_rows",
             f"{when}, {record.shows}s and poses are {apart} apart: the {record.shows} of each row "
             f"belongs to the robot's pose {rows}.{left}{dropped}",
-            mending("each has its own pose", f"--shift {first}-{last}:{by}"),
+            mending("each has its own pose", Option("shift", f"{by}", (*range(first, last + 1),))),
             tuple(views),
         ),
         f"its {record.shows} belongs to the robot's pose {rows}",

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, Calib
 from visioncal.core.number_format import figure, mm_and_deg, ranges, view_words
 from visioncal.core.transforms import LEVER_M, exp, invert, log, pose_difference, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Target
-from visioncal.core.verdict import Finding, Remedy, mending, or_alone
+from visioncal.core.verdict import Finding, Option, Remedy, mending, or_alone
 from visioncal.estimation.moves import find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.steps import step_of
@@ -290,15 +290,15 @@ def without_tool(tool: FloatArray, views: Sequence[int], otherwise: str) -> Reme
     """Advice to take a tool (4, 4) in the flange off some views' poses, if it was active there."""
     twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
     numbers = ",".join(f"{value:.4f}" for value in twist)
-    done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
-    first = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
-    return replace(done, words=f"{first} Else {otherwise}")
+    option = Option("without-tool", numbers, tuple(views), tool)
+    first = "Look whether a tool was active there. If so, "
+    return mending("it is taken off their poses", option, first, f". Else {otherwise}")
 
 
 def turned_back(board: Target, views: Sequence[int]) -> Remedy:
     """Advice to turn a board back that some views number from the other end."""
     _, (x, y) = half_turn_of(board)
-    option = f"--turned {ranges(views)}:180,{1e3 * x:.2f},{1e3 * y:.2f}"
+    option = Option("turned", f"180,{1e3 * x:.2f},{1e3 * y:.2f}", tuple(views))
     return mending("it is turned back", option)
 
 

@@ -21,7 +21,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, listed, some_of, view_words
 from visioncal.core.transforms import distances, invert, pose_difference
 from visioncal.core.types import IntArray
-from visioncal.core.verdict import CALIBRATE, Remedy, mending
+from visioncal.core.verdict import CALIBRATE, Option, Remedy, mending
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import object_name
@@ -208,7 +208,7 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
         f"the other's row{order}. They were left out."
     )
     typed = ",".join(f"{first},{second}" for first, second in views)
-    do = mending(f"their {shown}s are exchanged", f"--exchange {typed}")
+    do = mending(f"their {shown}s are exchanged", Option("exchange", typed))
     yield fault_of(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
 
 
@@ -226,7 +226,7 @@ def _exchange(cell_fit: CellFit, rows: Sequence[int], stations: Sequence[int]) -
     if len(cell_fit.cell.poses) > 1 or not is_paired:
         return _EXCHANGE
     typed = ",".join(f"{view},{at_second[pair]}" for pair, view in at_first.items())
-    return mending("what was seen at the one is at the other", f"--exchange {typed}")
+    return mending("what was seen at the one is at the other", Option("exchange", typed))
 
 
 def _exchanged_in_turn(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> PoseFault:
@@ -240,7 +240,7 @@ def _exchanged_in_turn(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> P
         f"{{views}} are exchanged in turn ({listed(words)}): the {shown} of each fits the pose in "
         "the next one's row. They were left out."
     )
-    do = mending(f"their {shown}s are exchanged", f"--exchange {','.join(typed)}")
+    do = mending(f"their {shown}s are exchanged", Option("exchange", ",".join(typed)))
     return fault_of(cell_fit, EXCHANGED, sorted(chain.from_iterable(circles)), text, do)
 
 

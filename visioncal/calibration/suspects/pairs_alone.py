@@ -4,13 +4,11 @@ A cell takes the pictures of another lens, or a tool that was switched, for view
 frames that moved. Where pairs agree by themselves, and not with each other, that is named.
 """
 
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.recording import FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import of_pair
@@ -27,8 +25,8 @@ from visioncal.calibration.suspects.moved_views import (
 from visioncal.calibration.suspects.suspect import LIKE_KNOCKS, SOURCES, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import mm_and_deg, ranges, robot_words, some_of, view_words
-from visioncal.core.transforms import compose, invert, log, pose_difference
+from visioncal.core.number_format import mm_and_deg, robot_words, some_of, view_words
+from visioncal.core.transforms import invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import Finding, Remedy, or_alone
 from visioncal.estimation.unknowns import EDGE
@@ -48,9 +46,6 @@ _OF_CAMERA = ("other_lens", "image_sizes", "lens", "exchanged_views")
 _SIZES = (*SOURCES, "few_stops", "too_few_stops", "place", "weak_motion")
 # Frames by two pairs that are further apart than so many sigmas, and than an arm errs, are others.
 _SIGMAS = 6.0
-# Views whose poses or images an option changes, and the tool that one takes off.
-_ON_VIEWS = re.compile(r"--(shift|positions) ([\d,-]+):(\S+)")
-_TOOL = re.compile(r"--without-tool [\d,-]+:(\S+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +147,9 @@ def _of_cameras(
             found = cause.of("" if len(run.session.cameras) < 2 else one.pair.camera)
             if kind in LIKE_KNOCKS and cause.do is not None:
                 # The pair's later views are not all that could be calibrated alone.
-                do = Remedy(f"{cause.do.words.partition(';')[0].removesuffix('.')}.")
-                words = f"{found.words.partition(' The result counts')[0]}"
-                words += " The result treats the camera as moved." if knocked else ""
-                found = replace(found, words=words, do=do)
+                do = Remedy(cause.do.plain or cause.do.words)
+                moved = "The result treats the camera as moved." if knocked else ""
+                found = replace(found, consequence=moved, rivals=(), do=do)
             yield found
 
 
@@ -179,7 +173,7 @@ def _tool_switched(
 
     Each pair leaves out the views with the tool, or those without it: then its tool is the inverse.
     """
-    tools = [_tool_of(cause) for _, cause in found]
+    tools = [None if cause.do is None else cause.do.option.tool for _, cause in found]
     stops = stops_by_view(run.session)
     active, idle = set[int](), set[int]()
     for (one, cause), tool in zip(found, tools, strict=True):
@@ -214,16 +208,6 @@ def _tool_switched(
     return Finding("something_moved", f"{words[0].upper()}{words[1:]}", do, tuple(views))
 
 
-def _tool_of(cause: Finding) -> FloatArray | None:
-    """The tool (4, 4) in the flange that a finding takes off some poses; None of another one."""
-    named = _TOOL.search("" if cause.do is None else cause.do.command)
-    if named is None:
-        return None
-    numbers = np.array([float(number) for number in named[1].split(",")])
-    turn = Rotation.from_rotvec(numbers[3:], degrees=True).as_matrix()
-    return compose(turn, 1e-3 * numbers[:3])
-
-
 def _is_same(tool: FloatArray, other: FloatArray) -> bool:
     """Whether two tools or turns are one, but for what an arm errs by."""
     return bool(np.less(_apart(invert(tool) @ other), CalibrationLimits.arm_errors).all())
@@ -244,15 +228,14 @@ def of_all_rows(
     poses, these are the camera's rows.
     """
     do, rows = found.do, run.session.views
-    named = None if do is None else _ON_VIEWS.search(do.command)
-    if do is None or named is None:
+    if do is None or do.option.name not in ("shift", "positions"):
         return do
     stops = {stop_of(at) for at in rows if not found.views or at.number in found.views}
     of_robot = rows_of_robot(run.session, robot)
     ends = [at for at, view in enumerate(of_robot) if stop_of(view) in stops]
     if not ends:
         return Remedy(do.words)
-    if named[1] == "shift":
+    if do.option.name == "shift":
         shown = {*found.views} if pair is None else {*pair.poses}
         first = 0 if pair is not None and min(shown) in found.views else ends[0]
         end = None if pair is not None and max(shown) in found.views else ends[-1] + 1
@@ -260,10 +243,9 @@ def of_all_rows(
     if of_images and pair is not None:
         seers = {row.view.number: row.seer for row in run.session.observations}
         of_robot = [view for view in rows if seers.get(view.number) == pair.camera]
-    every = ranges([at.number for at in of_robot if stop_of(at) in stops])
-    typed = f"{named[1]} {every}:{named[3]}{':images' if of_images else ''}"
-    start, end = named.span()
-    return replace(do, command=f"{do.command[:start]}--{typed}{do.command[end:]}")
+    every = tuple(at.number for at in of_robot if stop_of(at) in stops)
+    value = f"{do.option.value}{':images' * of_images}"
+    return do.by(replace(do.option, value=value, views=every))
 
 
 def _contradictions(run: RunState, every: Sequence[PairAlone]) -> Iterator[Finding]:

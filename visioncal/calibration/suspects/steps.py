@@ -17,7 +17,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, ranges
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import LEFT_OPEN, Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
 from visioncal.robot.model import joint_words
 
@@ -41,9 +41,7 @@ def _found(run: RunState) -> Iterator[Finding]:
         mm > _LIMITS.arm_errors[0] or deg > _LIMITS.arm_errors[1] for mm, deg in moved
     ):
         return
-    step, instead = steps[0], ""
-    if steps[1:]:
-        instead = f"{LEFT_OPEN} {_words(steps[1], run)}."
+    step = steps[0]
     thing = _THINGS.get(step.of, step.of)
     fasten, note = f"Fasten {thing[0].lower()}{thing[1:]}", ""
     if (
@@ -61,11 +59,12 @@ def _found(run: RunState) -> Iterator[Finding]:
     is_drift = step.kind == DRIFT
     yield Finding(
         kind,
-        f"{_words(step, run)}; the result is between before and after.{instead}",
+        f"{_words(step, run)}; the result is between before and after.",
         Remedy(do)
         if is_drift
         else _of_tool(run, step, do) or cell.or_separately(do, step.stop, note),
         mahalanobis_sq=0.0 if is_drift else step.gain,
+        rivals=tuple(_words(other, run) for other in steps[1:2]),
     )
 
 

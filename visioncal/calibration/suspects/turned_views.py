@@ -7,9 +7,9 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import Suspect
-from visioncal.core.number_format import ranges, view_words
+from visioncal.core.number_format import view_words
 from visioncal.core.transforms import invert
-from visioncal.core.verdict import Finding, mending
+from visioncal.core.verdict import Finding, Option, mending
 from visioncal.vision.targets import rotation_transforms
 
 
@@ -34,7 +34,7 @@ def _found(run: RunState) -> Iterator[Finding]:
             f"In {view_words(views)} corners.csv numbers the board's corners as if it was turned "
             f"by {abs(degrees):.0f} deg, which its pattern allows: the robot's motion shows it, "
             "and the fit turned them back.",
-            mending("they are turned back", f"--turned {ranges(views)}:{about}"),
+            mending("they are turned back", Option("turned", about, views)),
             views,
         )
 

@@ -40,10 +40,10 @@ from visioncal.calibration.suspects.mistaken_rows import (
 from visioncal.calibration.suspects.record import LEAST, Edges, Record, StopOfRobot, evidence
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_COMPARED
-from visioncal.core.number_format import ranges, view_words
+from visioncal.core.number_format import view_words
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Rejection
-from visioncal.core.verdict import Finding, mending, or_alone
+from visioncal.core.verdict import Finding, Option, mending, or_alone
 from visioncal.vision.camera import turned_back
 
 # Share of a flip's angle that its mirror image leaves at most, and a flip's shift without unit:
@@ -196,7 +196,7 @@ def _turned_pictures(
                 "was set otherwise, or the target's poses are. They were left out: the camera's "
                 "transform is that of the other pictures, and differs by this turn for pictures "
                 "as these.",
-                mending("they are turned back", f"--turned {ranges(views)}:{degrees}"),
+                mending("they are turned back", Option("turned", f"{degrees}", views)),
                 views,
             ),
             "its picture is turned",

@@ -1,0 +1,104 @@
+"""Findings and remedies carry their parts: none is read out of words or commands."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.cells import pairs_session
+from test_undone import poses_of
+
+from visioncal.calibration.pipeline.explaining import explained
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import Stage, run_stages
+from visioncal.calibration.suspects.moved_views import without_tool
+from visioncal.calibration.suspects.pairs_alone import PairAlone, found_alone, of_all_rows
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import exp
+from visioncal.core.types import MOUNTS
+from visioncal.core.verdict import Finding, Option, Remedy, Verdict, mending
+from visioncal.simulation import NetworkOptions, cell_session, simulate
+
+# Sentences that end where others begin to say what follows from a cause.
+_CAUSE = "The lens changed; its focus is another one. The result counts in pixels."
+
+
+@pytest.mark.parametrize(
+    ("parts", "do", "advice"),
+    [
+        (
+            {"consequence": "The result counts it."},
+            Remedy("Hold it; or go.", plain="Hold."),
+            "Hold.",
+        ),
+        ({"rivals": ("the board grew",)}, Remedy("Hold it; then go."), "Hold it; then go."),
+        ({}, Remedy("Hold it."), "Hold it."),
+    ],
+)
+def test_a_cell_has_the_whole_cause_of_a_pair_and_no_consequence(parts, do, advice):
+    found = Finding("focus", _CAUSE, do, probability=0.9, **parts)
+    answer = SimpleNamespace(verdict=Verdict("check", (found,)))
+    pair = SimpleNamespace(camera="cam_top", target="target")
+    run = SimpleNamespace(
+        session=SimpleNamespace(robots={"a": None}, cameras={"top": None, "side": None}),
+        assessment_or_none=None,
+    )
+    (cause,) = found_alone(run, [PairAlone("a", pair, answer)])
+    assert cause.in_words().words == f"cam_top: {_CAUSE[0].lower()}{_CAUSE[1:]}"
+    assert cause.do == Remedy(advice)
+
+
+def test_rows_of_a_whole_robot_are_shifted_by_the_option_whatever_the_words_are():
+    session = cell_session(simulate(NetworkOptions(stops=8)), "cell", seen="corners")
+    rows = [view for view in session.views if view.text.get("robot") == "a"]
+    shown = tuple(view.number for view in rows if view.stop in (2, 4))
+    words = "each has its own pose (not by --shift 1-2:9, nor by --positions 3:x,y,z)"
+    do = mending(words, Option("shift", "-2", shown))
+    found = Finding("shifted_rows", "Rows are apart.", do, shown)
+    every = of_all_rows(found, RunState(session), "a")
+    between = tuple(view.number for view in rows if 2 <= view.stop <= 4)
+    assert len(between) > len(shown)
+    assert every.words == do.words
+    assert every.option == replace(do.option, views=between)
+    assert f"FIXED {every.option} && " in every.command
+    other = replace(do, option=Option("turned", "180,0,0", (3,)))
+    assert of_all_rows(replace(found, do=other), RunState(session), "a") is other
+
+
+def test_a_tool_is_that_of_the_views_to_all_digits():
+    tool = exp(np.array([0.1, -0.2, 0.3, 1.23456789e-2, 0.0, 0.15]))
+    do = without_tool(tool, [3, 4, 6], "look again.")
+    assert do.option.tool is tool
+    assert f"--without-tool 3-4,6:{do.option.value} " in do.command
+    assert do.words.endswith("it is taken off their poses, and calibrate it. Else look again.")
+
+
+def test_commands_of_many_robots_are_by_hand_by_their_options_alone():
+    do = mending("joints give the poses", Option("by-joints"))
+    assert not do.of_cell(2, 1).command
+    assert do.of_cell(1, 2) is do
+    # Such letters may be of a name.
+    board = mending("it is larger", Option("board-scale", "a--by-joints:1.01"))
+    assert board.of_cell(2, 1) is board
+    lens = mending("the lens is estimated", Option("intrinsics", "estimate"))
+    assert not lens.of_cell(1, 2).command
+
+
+def test_an_error_is_explained_by_what_explains_it_not_by_its_message(monkeypatch):
+    state, error = RunState(pairs_session(MOUNTS[0], *poses_of(MOUNTS[0]))), DegenerateError("Few.")
+    assert explained(error, state, "solve", are_located=False) is None
+
+    def fails(_: RunState) -> RunState:
+        raise error
+
+    said = {"alone": DegenerateError("Few.", next_step="Look."), "beside": None}
+    monkeypatch.setattr("visioncal.calibration.run._explained_by_pairs", lambda *_: said["beside"])
+    with pytest.raises(DegenerateError, match=r"^Few\.$"):
+        run_stages(state, [Stage("solve", fails)])
+    said["beside"] = DegenerateError("A pair shows it.")
+    with pytest.raises(DegenerateError, match="A pair shows it"):
+        run_stages(state, [Stage("solve", fails)])
+    # A cause may say the same, with a step.
+    monkeypatch.setattr("visioncal.calibration.run.explained", lambda *_, **__: said["alone"])
+    with pytest.raises(DegenerateError, match=r"^Few\. Look\.$"):
+        run_stages(state, [Stage("solve", fails)])
