@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Self
 
-# Messages quote input, which may be a whole file; their greatest length, and that of a line.
-_MOST_LETTERS, _LEAST_LETTERS = 2000, 300
+# Greatest length of a line of a message, which may quote input.
+_LEAST_LETTERS = 300
 
 
 class VisioncalError(Exception):
@@ -18,7 +18,8 @@ class VisioncalError(Exception):
 
     def __init__(self, message: str, *, culprits: Sequence[str] = (), next_step: str = "") -> None:
         lines = message.split("\n")
-        most = max(_MOST_LETTERS // len(lines), _LEAST_LETTERS)
+        # Messages quote input, which may be a whole file: their greatest length.
+        most = max(2000 // len(lines), _LEAST_LETTERS)
         message = "\n".join(_shortened(line, most) for line in lines)
         super().__init__(message)
         self.message = message

@@ -13,12 +13,6 @@ ITERATIONS = 400
 # Decrease of the cost, relative to the cost plus one, below which it has converged.
 SETTLED = 1e-10
 START_DAMPING = 1e-4
-# The iteration ends at a step that raises the cost with a smaller predicted decrease (a hundredth
-# of a sigma).
-_LITTLE = 1e-4
-# At convergence, a step whose predicted decrease is below this share of the tolerance is skipped,
-# so that the problem is already linearised at the returned state.
-_NOTHING = 0.1
 # Least damping, and that near the solution, where poorly determined directions would need many
 # damped steps; its inverse leaves no step.
 NEAR_DAMPING = 1e-9
@@ -55,7 +49,9 @@ def levenberg_marquardt(
         predicted = now.fall(damping) if now.fall is not None else np.inf
         tolerance = settled * (abs(now.cost) + 1.0)
         if 0.0 <= predicted <= tolerance:
-            return now.state if predicted <= _NOTHING * tolerance else now.step(damping), True
+            # At convergence, a step whose predicted decrease is below this share of the tolerance
+            # is skipped, so that the problem is already linearised at the returned state.
+            return now.state if predicted <= 0.1 * tolerance else now.step(damping), True
         trial = linearise(now.step(damping))
         if trial.cost <= now.cost:
             decrease, factor = now.cost - trial.cost, 0.1
@@ -67,8 +63,9 @@ def levenberg_marquardt(
                 return now.state, True
         else:
             # The rest is rounding, curvature that Gauss-Newton neglects, or an error of the
-            # derivatives.
-            if predicted <= _LITTLE:
+            # derivatives. The iteration ends at a step that raises the cost with a smaller
+            # predicted decrease (a hundredth of a sigma).
+            if predicted <= 1e-4:
                 return now.state, True
             damping = max(10.0 * damping, START_DAMPING)
             if damping > 1.0 / NEAR_DAMPING:

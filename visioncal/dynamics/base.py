@@ -39,8 +39,6 @@ _NEXT = (
 # Standard deviation of the prior in each log-Cholesky coordinate: 30 % of a link's extent, twice
 # that of its mass.
 PRIOR_SIGMA = 0.3
-# Bound of the coordinates, in prior sigmas: extents of 90 times the known ones, short of overflow.
-_FARTHEST = 15.0
 # Prefixes of the joint parameters that cannot be negative.
 _POSITIVE = ("Fc", "Fv", "Ia")
 
@@ -292,7 +290,9 @@ def fit_consistent(
         return np.concatenate([whitened(base.dependence @ jacobian(unknowns)), prior])
 
     upper = np.full(count + len(names), np.inf)
-    upper[:count] = _FARTHEST
+    # Bound of the coordinates, in prior sigmas: extents of 90 times the known ones, short of
+    # overflow.
+    upper[:count] = 15.0
     lower = -upper
     # Negative friction or inertia is noise, or the model does not fit.
     lower[count:][[name.startswith(_POSITIVE) for name in names]] = 0.0

@@ -23,16 +23,14 @@ from visioncal.robot.inertia import Inertias
 from visioncal.robot.loads import gravity_words
 from visioncal.robot.torques import body_regressor, joint_torques
 
-# Least number of a test's samples: sweeps of single joints have fewer.
-_LEAST = 100
 # A mistake is reported where undoing it divides the torques' unexplained power by this factor, and
 # leaves at most this share unexplained in the joints concerned: by known inertias, by the best fit.
 # Best fits of correct recordings improve by a factor of 1.2 at most. Mistakes that are nearly as
 # likely are named, too: slow sweeps hardly separate swapped torques from swapped angles.
 _BETTER, _LEFT = 10.0, {True: 0.5, False: 0.1}
 # Torques whose scale to the predicted ones is outside these factors are in other units, such as
-# motor-side torques; only joints of whose torque the links make up at least this share are tested.
-_HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
+# motor-side torques.
+_HIGH, _LOW = 5.0, 0.2
 # Cosine of the angle, 5 deg, up to which a mount is that of an axis, and levelled.
 _ALIGNED = 0.9962
 
@@ -50,7 +48,8 @@ def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         piece = max(stream.pieces, key=lambda value: len(value.measured))
         good = np.flatnonzero(piece.present & ~piece.invalid.any(axis=1))
         measured = piece.measured.chosen(good[:: max(len(good) // 250, 1)])
-        if len(measured) >= _LEAST:
+        # Least number of a test's samples: sweeps of single joints have fewer.
+        if len(measured) >= 100:
             if base.model.robot.inertias is not None:
                 _check_conventions(base, stream.label, measured, known=True)
                 # A tool may multiply a wrist's torques.
@@ -253,7 +252,8 @@ def described_scales(robot: Robot, measured: Measured) -> FloatArray:
         factors, left = _joint_fit(measured, predicted, joint)
         power = max(float(np.var(measured.torques_nm[:, joint])), 1e-24)
         share = factors[0] ** 2 * np.var(predicted[:, joint]) / power
-        if share > _SHARE and left < _LEFT[True]:
+        # Only joints of whose torque the links make up at least this share are tested.
+        if share > 0.3 and left < _LEFT[True]:
             scales[joint] = factors[0]
     return scales
 

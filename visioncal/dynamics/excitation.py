@@ -34,9 +34,8 @@ _ROUNDS = ((1.0, 10.0), (4.0, 80.0), (15.0, 640.0))
 # Sampling of the condition numbers, which do not change with more.
 _FIGURES_HZ = 100.0
 
-# Samples of the regressor per period of the highest harmonic, and how many times denser limits and
-# distances are sampled.
-_SAMPLES, _LIMIT_DENSITY = 10, 3
+# How many times denser than the regressor limits and distances are sampled.
+_LIMIT_DENSITY = 3
 # Finite-difference steps of regressor and distances [rad and its rates], far above rounding.
 _STEP, _STEP_CLEAR = 1e-6, 1e-5
 
@@ -129,7 +128,8 @@ class Objective:
         # smooth.
         terms = replace(base.model.terms, slow_rad_s=0.03 * float(allowed.speed.max()))
         self._base = replace(base, model=DynamicModel(base.model.robot, terms))
-        count = _SAMPLES * harmonics.count
+        # Samples of the regressor per period of the highest harmonic.
+        count = 10 * harmonics.count
         # Between the ends, where speeds are zero and have no sign.
         self._times = (np.arange(count) + 0.5) * harmonics.period_s / count
         self._basis = harmonics.basis(self._times)

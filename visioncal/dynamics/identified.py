@@ -118,12 +118,6 @@ class Identified:
 
 # Standard gravity, for masses by their weight [m/s^2].
 _GRAVITY_M_S2 = 9.80665
-# Mass at the full reach that would have an arm's torques, over the cube of the reach [kg/m^3]. The
-# whole mass of arms is 6 (a light cobot) to 150 (a foundry's robot) by this, a tenth of it or more
-# acts there, and wrong units differ by a thousand.
-_ARM_DENSITY = (0.1, 1000.0)
-# Sigmas by which dry friction below zero is no chance.
-_SURE = 5.0
 
 
 def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
@@ -175,7 +169,10 @@ def _of_size(identified: Identified) -> Iterator[_Judged]:
         float(np.abs(by_weight).max()) / (_GRAVITY_M_S2 * reach_m),
         float(np.abs(by_inertia - by_weight).max()) / (push * reach_m**2),
     )
-    light, heavy = (density * reach_m**3 for density in _ARM_DENSITY)
+    # Mass at the full reach that would have an arm's torques, over the cube of the reach [kg/m^3].
+    # The whole mass of arms is 6 (a light cobot) to 150 (a foundry's robot) by this, a tenth of it
+    # or more acts there, and wrong units differ by a thousand.
+    light, heavy = (density * reach_m**3 for density in (0.1, 1000.0))
     if light <= mass_kg <= heavy:
         return
     factor = 0.001 if mass_kg > heavy else 1000.0
@@ -197,7 +194,8 @@ def _of_signs(identified: Identified) -> Iterator[_Judged]:
             continue
         at = names.index(name)
         sigma = float(np.sqrt(identified.covariance[at, at]))
-        if values[at] < -_SURE * sigma:
+        # Sigmas by which dry friction below zero is no chance.
+        if values[at] < -5.0 * sigma:
             words = (
                 f"Joint {joint + 1}: its dry friction is {figure(float(values[at]))} N m (sigma "
                 f"{figure(sigma)}), and friction drives no joint: its torque, or its angle, has "

@@ -23,10 +23,8 @@ _HOW = (
     "A stream for dynamics has stamp_s, q1_rad ..., and tau1_nm ... or current1_a ... of every "
     "joint, from the base to the tip; dq1_rad_s ... where the controller reports speeds."
 )
-# Clocks whose jitter exceeds the first share of the usual step are resampled. Up to the second
-# share of jitter, a step of several usual ones means missing samples; on a less even clock, only a
-# gap as of a trajectory.
-_JITTER, _EVEN = 0.02, 0.1
+# Clocks whose jitter exceeds this share of the usual step are resampled.
+_JITTER = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +133,9 @@ class StampClock:
         usual = float(np.median(steps))
         counts = np.maximum(np.rint(steps / usual), 1.0)
         jitter = _jitter(steps, counts, usual)
-        if jitter > _EVEN:
+        # Up to this share of jitter, a step of several usual ones means missing samples; on a less
+        # even clock, only a gap as of a trajectory.
+        if jitter > 0.1:
             counts[steps <= max(GAP_RATIO * usual, SHORT_GAP_S)] = 1.0
             jitter = _jitter(steps, counts, usual)
         return cls(usual, counts.astype(np.int64), jitter)

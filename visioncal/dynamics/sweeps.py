@@ -21,12 +21,10 @@ from visioncal.dynamics.model import JointMotion
 
 # Least duration of ramps, and of constant speed [s].
 _SHORTEST_RAMP_S, _SHORTEST_HOLD_S = 0.15, 0.4
-# Rest after each stroke [s].
-REST_S = 0.2
 # Share of the greatest speed and acceleration for moves between sweeps.
 _UNHURRIED = 0.2
-# Greatest range of a sweep, and step of the search for a joint's free range [rad].
-_WIDEST_RAD, _STEP_RAD = 2.4, 0.1
+# Step of the search for a joint's free range [rad].
+_STEP_RAD = 0.1
 
 
 @dataclass(frozen=True)
@@ -191,7 +189,8 @@ def _move(allowed: MotionLimits, joint: int, begin: float, end: float) -> Iterat
 def _free_end(allowed: MotionLimits, home: FloatArray, joint: int, sense: int) -> float:
     """End of a joint's free range to one side, searched in steps [rad]."""
     limit = (allowed.upper if sense > 0 else allowed.lower)[joint]
-    distance = min(abs(float(limit - home[joint])), 0.5 * _WIDEST_RAD)
+    # Half of the greatest range of a sweep [rad].
+    distance = min(abs(float(limit - home[joint])), 1.2)
     steps = np.append(np.arange(_STEP_RAD, distance, _STEP_RAD), distance)
     postures = np.repeat(home[None], len(steps), axis=0)
     postures[:, joint] += sense * steps
@@ -216,7 +215,8 @@ def _checked_range(
 
 
 def _begins(strokes: tuple[Stroke, ...]) -> FloatArray:
-    lengths = [stroke.duration_s + REST_S for stroke in strokes]
+    # Rest after each stroke [s].
+    lengths = [stroke.duration_s + 0.2 for stroke in strokes]
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 

@@ -45,11 +45,8 @@ _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
 # Thermal expansion or an arm's scale error is below this share; the wrong drawing differs by more.
 _WARM = 1e-3
-# Orders of names that are listed where points are symmetric.
-_ORDERS = 2
-# Smallest cosine between the points' plane normal and the drawing's z for the plane to be an xy
-# plane, and between the tool's direction and z for the touched side to be known.
-_FLAT, _ASIDE = 0.9, 0.3
+# Smallest cosine between the tool's direction and the drawing's z for the touched side to be known.
+_ASIDE = 0.3
 
 
 @typed
@@ -247,7 +244,9 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
         normal = spreads(pairs.nominal[fitted.agrees])[1][2]
         cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
         # The side of the touches determines the handedness of points in the drawing's xy plane.
-        side = float(cosines.mean()) if abs(normal[2]) > _FLAT else 0.0
+        # Smallest cosine between the points' plane normal and the drawing's z for the plane to be
+        # an xy plane.
+        side = float(cosines.mean()) if abs(normal[2]) > 0.9 else 0.0
         if side < -_ASIDE:
             words = (
                 "and the fixture's z axis points away from the side that the tool came from: a "
@@ -295,9 +294,8 @@ def _finding_of(mistake: Mistake, drawing: NominalPoints) -> Finding:
         pairs = ", or of ".join(" and ".join(renamed) for renamed in rivals)
         words = f"Of {pairs}, the names are exchanged: with the other name for each, {agree}"
     else:
-        orders = (
-            ", ".join(f"{a} is {b}" for a, b in renamed.items()) for renamed in rivals[:_ORDERS]
-        )
+        # Orders of names that are listed where points are symmetric.
+        orders = (", ".join(f"{a} is {b}" for a, b in renamed.items()) for renamed in rivals[:2])
         words = f"The points have each other's names ({'; or '.join(orders)}): corrected, {agree}"
     words += f" Or {mirror}" * ({} in mistake.renamed)
     do = Remedy("Look which points were touched, and write their names in the rows.", AGAIN)

@@ -13,11 +13,6 @@ from visioncal.frames.placing import DISAGREE_M, LEAST_NOISE_M
 from visioncal.frames.pointfit import PointPairs
 from visioncal.frames.touches import Tool
 
-# Touches of which nine unknowns leave six coordinates to be checked with.
-_FEWEST = 5
-# Lengths of tools along the flange's z from which the search starts [m].
-_LENGTHS_M = (0.0, 0.1, 0.2, 0.4)
-
 
 def with_other_tip(
     error: DataError, pairs: PointPairs, poses: FloatArray, tool: Tool | None
@@ -30,11 +25,15 @@ def with_other_tip(
         poses: (n, 4, 4) of the flange at the touches [m]; NaN where a rotation is not known.
         tool: The stated tool; None where the poses are of its tip.
     """
-    if len(pairs) < _FEWEST or not np.isfinite(poses).all():
+    # Touches of which nine unknowns leave six coordinates to be checked with.
+    if len(pairs) < 5 or not np.isfinite(poses).all():
         return error
     by_tool = align(pairs.measured, pairs.nominal)
     off_m = np.sqrt(np.mean((apply(by_tool[None], pairs.nominal)[0] - pairs.measured) ** 2))
-    fit = min((_fitted(pairs, poses, length) for length in _LENGTHS_M), key=lambda at: at.sigma)
+    # Lengths of tools along the flange's z from which the search starts [m].
+    fit = min(
+        (_fitted(pairs, poses, length) for length in (0.0, 0.1, 0.2, 0.4)), key=lambda at: at.sigma
+    )
     if fit.sigma > DISAGREE_M or CLEAR_RATIO * fit.sigma > off_m:
         return error
     tip, reference = fit.state.points[0], "as poses of the tip itself (--tool none)"

@@ -21,17 +21,14 @@ LEAST_NOISE_M = 1e-6
 TOUCH_NOISE_M = 1e-4
 # Noise beyond which touches may be of other kinds, or by another tool [m].
 DISAGREE_M = 1e-3
-# Touches at most of which any two are tried with each other's kinds.
-_MOST_TRIED = 24
 _Kind = TypeVar("_Kind", bound=str)
-# Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
-# sigma in one frame of twelve. Features that were touched twice leave six.
-_ENOUGH = 6
 
 
 def counted_noise_m(fit: GroupFit, expected_m: float) -> float:
     """Noise of a touch that counts [m]: with few degrees of freedom at least the expected one."""
-    return fit.sigma if fit.freedom >= _ENOUGH else max(fit.sigma, expected_m)
+    # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
+    # sigma in one frame of twelve. Features that were touched twice leave six.
+    return fit.sigma if fit.freedom >= 6 else max(fit.sigma, expected_m)
 
 
 def assumed_words(noise_m: float, stated_m: float | None) -> str:
@@ -98,8 +95,9 @@ def refuse_exchanged_kinds(
     if declared is None or declared.sigma < DISAGREE_M:
         return
     tried = list[tuple[GroupFit | None, str, Sequence[str]]]()
-    # Of many touches each two take too long, and none stands for all.
-    some = range(len(kinds) if len(kinds) <= _MOST_TRIED else 0)
+    # Of many touches each two take too long, and none stands for all. Touches at most of which any
+    # two are tried with each other's kinds.
+    some = range(len(kinds) if len(kinds) <= 24 else 0)
     for a, b in combinations(some, 2):
         if kinds[a] != kinds[b]:
             exchanged = tuple(kinds[{a: b, b: a}.get(row, row)] for row in range(len(kinds)))

@@ -37,8 +37,8 @@ from visioncal.frames.placing import (
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")
-# Names that are tried in all pairs, and in any order; and frames by three points that are tried.
-_MOST_NAMES, _FRAMES = 12, 40
+# Names that are tried in all pairs, and in any order.
+_MOST_NAMES = 12
 # Units of a drawing in place of those that it has, by the ratio of the part to it.
 _UNITS = {
     25.4: "inches read as millimetres (--cad-unit inch)",
@@ -328,7 +328,8 @@ def _orders(pairs: PointPairs, names: Sequence[str]) -> list[dict[str, str]]:
 
     three = triples[int(np.argmax(sides(measured[triples]).min(axis=1)))]
     apart = np.abs(sides(drawn[triples]) - sides(measured[three])).max(axis=1)
-    nearest = triples[np.argsort(apart, kind="stable")[:_FRAMES]]
+    # Frames by three points that are tried.
+    nearest = triples[np.argsort(apart, kind="stable")[:40]]
     frames = align(measured[three], drawn[nearest])
     places = apply(frames, drawn)
     off_m = np.linalg.norm(measured[:, None] - places[:, None, :, :], axis=-1)

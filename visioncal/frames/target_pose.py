@@ -35,9 +35,6 @@ from visioncal.vision.targets import load_target
 Parent: TypeAlias = Literal["base", "flange"]
 # Squared distance beyond which two poses differ significantly.
 _DIFFERENT = float(chi2_limit(0.05, 6))
-# Sigma of a board's size where another one is tried, the least error that is named, and the share
-# of the scatter that it explains.
-_ANY_SIZE, _LEAST_SIZE, _EXPLAINED = 0.1, 2e-3, 0.75
 _FEWEST_FOR_SIZE = 3
 
 
@@ -419,11 +416,13 @@ def _size_warning(fit: _ImageInliers, candidates: _CandidateViews) -> Iterator[s
     if scatter < chi2_limit(FALSE_ALARM, 1) or fit.inliers.sum() < _FEWEST_FOR_SIZE:
         return
     common = candidates.common.copy()
-    common[-1, -1] = _ANY_SIZE**2
+    # Sigma of a board's size where another one is tried, the least error that is named, and the
+    # share of the scatter that it explains.
+    common[-1, -1] = 0.1**2
     sized = _find_inliers(replace(candidates, common=common))
     share = float(sized.errors[-1])
-    is_explained = sized.variance - 1.0 < (1.0 - _EXPLAINED) * (fit.variance - 1.0)
-    if is_explained and abs(share) > _LEAST_SIZE and sized.inliers.sum() >= fit.inliers.sum():
+    is_explained = sized.variance - 1.0 < (1.0 - 0.75) * (fit.variance - 1.0)
+    if is_explained and abs(share) > 2e-3 and sized.inliers.sum() >= fit.inliers.sum():
         # A board that is larger is seen as if the stated one were nearer.
         than = "larger" if share < 0.0 else "smaller"
         yield (

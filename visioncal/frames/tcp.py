@@ -33,8 +33,6 @@ from visioncal.results import Calibration, Edge, Frame
 from visioncal.robot import Robot
 
 TOUCH_KINDS = ("point", "z", "xz")
-# Distance within which touches are of one point, over the noise of a touch per axis.
-_NEAR = 6.0
 _INVERSE = Finding(
     "inverse_poses",
     "The tip would be farther from the flange than the point from the base: poses read the other "
@@ -191,7 +189,8 @@ def _other_points(fit: PivotFit, touches: Touches, places: Sequence[str]) -> Ite
         out = np.flatnonzero(of_point & ~inliers.mask)
         middle = np.median(tips[out, :3], axis=0) if len(out) else np.zeros(3)
         off_m = np.linalg.norm(tips[out, :3] - middle, axis=1)
-        near = off_m < _NEAR * inliers.fit.sigma
+        # Distance within which touches are of one point, over the noise of a touch per axis.
+        near = off_m < 6.0 * inliers.fit.sigma
         if near.sum() < 2:
             continue
         apart_m = float(np.linalg.norm(middle - inliers.fit.state.points[at]))

@@ -23,8 +23,8 @@ from visioncal.robot.collision import camera_body
 from visioncal.session import Session
 from visioncal.vision.targets import corner_positions
 
-# Reading error of a gap, by a feeler gauge or by eye over a tip, and the least that is read [mm].
-_READ_MM, _LEAST_READ_MM = 0.1, 0.01
+# Least gap that is read [mm].
+_LEAST_READ_MM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +129,9 @@ def touch_targets(
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
         covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
-        # Rounded up: no gap as large as the stated limit exceeds it.
-        radius_mm = rounded_up(float(np.hypot(1e3 * radius95(covariance), _READ_MM)))
+        # Rounded up: no gap as large as the stated limit exceeds it. Reading error of a gap, by a
+        # feeler gauge or by eye over a tip [mm].
+        radius_mm = rounded_up(float(np.hypot(1e3 * radius95(covariance), 0.1)))
         points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
     return TouchTargets(tuple(points), frame)
 

@@ -20,8 +20,8 @@ _AMBIENT = "ambient_c"
 _FORMS: Mapping[Kind, str] = {"temperatures": "temp{}_c", "currents": "current{}_a"}
 # Largest time of views before the first and after the last sample [s].
 _BEYOND_S = 300.0
-# More samples determine warm-up no better: they are averaged in groups.
-_MOST_SAMPLES, FEWEST_SAMPLES = 8192, 3
+# Fewest samples of a course of temperatures.
+FEWEST_SAMPLES = 3
 # Prior: relative growth per kelvin (12e-6 of steel, 23e-6 of aluminium); a zero drifts by about a
 # hundredth of a millimetre at one metre per kelvin, either way.
 _GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
@@ -68,7 +68,8 @@ def _averaged(
     at_s, air = next((group for group in of_air if len(group[0])), (stamps_s, np.zeros((1, 1))))
     ambient = np.interp(stamps_s, at_s, np.broadcast_to(air[:, 0], len(at_s)))
     columns = np.column_stack([stamps_s, ambient, heat if kind == "temperatures" else heat**2])
-    starts = np.arange(0, len(columns), -(-len(columns) // _MOST_SAMPLES))
+    # More samples determine warm-up no better: they are averaged in groups.
+    starts = np.arange(0, len(columns), -(-len(columns) // 8192))
     lengths = np.diff(np.append(starts, len(columns)))
     means = np.add.reduceat(columns, starts) / lengths[:, None]
     return Inputs(kind, means[:, 0], means[:, 2:], means[:, 1])

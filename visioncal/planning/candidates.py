@@ -17,9 +17,8 @@ from visioncal.robot.inverse import Inverse
 # A stop must show the board in this share of the draws of the uncertain cell; where too few do, the
 # next share is tried.
 _SHARES = (0.99, 0.97, 0.9, 0.7, 0.5)
-# Views or postures per draw; draws before the next share is tried, and how many where next to none
-# are found: less than this share of the requested number.
-_BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 8, 0.03
+# Views or postures per draw.
+_BATCH = 2000
 # Number of stops from which the range of useful distances is taken.
 _SAMPLE = 100
 # A joint cannot pass a range of angles at least this wide [rad] in which no stop has it and this
@@ -123,9 +122,11 @@ class _CandidateSearch:
         in_views = self._cell.robot.joint_count >= 6
         draw = self._from_views if in_views else self._from_postures
         for self._least_share in _SHARES:
-            for draws in range(_DRAWS):
-                poor = len(self.kept) < _NEXT_TO_NONE * self._count
-                if len(self.kept) >= self._count or (poor and draws >= _FIRST_DRAWS):
+            # Draws before the next share is tried, and how many where next to none are found: less
+            # than this share of the requested number.
+            for draws in range(100):
+                poor = len(self.kept) < 0.03 * self._count
+                if len(self.kept) >= self._count or (poor and draws >= 8):
                     break
                 self._keep(*draw())
                 if not narrowed and len(self.kept) >= min(_SAMPLE, self._count):

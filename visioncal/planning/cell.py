@@ -28,8 +28,8 @@ from visioncal.vision.targets import (
 
 # Noise of well-kept arms and cameras, where none is stated [rad, m and px].
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(5e-5, 3e-5), 0.1
-# Thickness of the plate under a board, and its rim around the print [m].
-_PLATE_M, _RIM_M = 0.01, 0.02
+# Thickness of the plate under a board [m].
+_PLATE_M = 0.01
 
 
 _TILT = Check(
@@ -318,5 +318,6 @@ def _board(target: Target, link: int, link_from_target: FloatArray, unsure_m: fl
     """The plate, whose face is the print."""
     low, high = extent_m(target)
     centre = compose(np.eye(3), np.append(0.5 * (low + high), 0.5 * _PLATE_M))
-    size = np.append(high - low + 2.0 * _RIM_M, _PLATE_M)
+    # The rim around the print has 0.02 m.
+    size = np.append(high - low + 0.04, _PLATE_M)
     return Body("board", link, "box", size, link_from_target @ centre, uncertainty_m=unsure_m)

@@ -40,9 +40,6 @@ WORLDS = 4
 # A calibration does not use the guesses. This weak prior on the edges only keeps the information
 # invertible [rad and m] in directions that the stops do not determine.
 WEAK_SIGMA = 0.2
-# Likewise on a lens that the stops are to determine: its matrix, as a share of the focal length,
-# and coefficients of distortion. A third radial one is known from ten stops to about 0.7.
-_LENS_SHARE, _DISTORTION_SIGMA = 0.1, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +216,10 @@ def _lens_rows(
 
 def _lens_sigmas(camera: Camera) -> FloatArray:
     """(k,) weak prior sigmas of a camera's intrinsics."""
-    sigmas = np.full(len(intrinsics(camera)), _DISTORTION_SIGMA)
-    sigmas[:4] = _LENS_SHARE * camera.matrix[0]
+    # Of coefficients of distortion, and of the matrix, as a share of the focal length. A third
+    # radial coefficient is known from ten stops to about 0.7.
+    sigmas = np.full(len(intrinsics(camera)), 10.0)
+    sigmas[:4] = 0.1 * camera.matrix[0]
     return sigmas
 
 

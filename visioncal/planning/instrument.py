@@ -39,8 +39,6 @@ from visioncal.robot.errors import TWIST_UNITS
 
 # Condition of Phi^T Phi, in mm and mrad, up to which the linear solution is numerically stable.
 STABLE = 1e6
-_BATCH, _DRAWS, _ROUNDS = 1000, 60, 12
-_DETERMINED = 1e-6  # Share of the largest pivot from which a parameter is identifiable.
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +60,8 @@ class InstrumentPlan:
         # Pivots pick one parameter of each redundant combination (Khalil and Dombre 2002, 11.4).
         _, pivots, order = qr(self._phi(self.candidates), mode="economic", pivoting=True)
         sizes = np.abs(np.diag(pivots))
-        return np.sort(order[: int(np.sum(sizes > _DETERMINED * sizes[0]))])
+        # Share of the largest pivot from which a parameter is identifiable.
+        return np.sort(order[: int(np.sum(sizes > 1e-6 * sizes[0]))])
 
     def _phi(self, q: FloatArray) -> FloatArray:
         """Jacobian of the readings by all parameters, in m and rad: the same in mm and mrad."""
@@ -143,7 +142,8 @@ def plan_for_instrument(
     left = np.arange(len(candidates))
     with one_blas_thread():
         world = _world(cell, purpose, candidates, recorded)
-        for attempt in range(_ROUNDS):
+        # Most rounds in which stops without a safe path are replaced.
+        for attempt in range(12):
             design = choose_stops([world.of_candidates(left)], count, criterion)
             q = candidates[left[design.rows]]
             route = order_stops(cell, start_q, q, seed)
@@ -177,8 +177,9 @@ def _candidates(cell: InstrumentCell, possible: int, least: int, seed: int) -> F
         np.minimum(robot.upper_rad - margin, turn),
     )
     kept, lost = list[FloatArray](), {"the clearance": 0, "a line of sight": 0}
-    for _ in range(_DRAWS):
-        q = rng.uniform(low, high, (_BATCH, len(low)))
+    # Draws of postures, 1000 each.
+    for _ in range(60):
+        q = rng.uniform(low, high, (1000, len(low)))
         clear = collisions.first_contact(q) < 0
         q, lost["the clearance"] = q[clear], lost["the clearance"] + int((~clear).sum())
         flange = robot.base_from_flange(q)

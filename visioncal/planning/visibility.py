@@ -14,9 +14,6 @@ from visioncal.robot.collision import Body, arm_bodies
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m, outline
 
-# Range of distances, relative to that at which the print's half diagonal fills the image's half
-# short side.
-_NEAREST, _FARTHEST = 0.75, 1.6
 # Factor by which draws extend the range of distances found useful.
 _WIDER = 1.05
 # Draws of the uncertain cell, the numbers of them after which hopeless poses are dropped, and the
@@ -97,12 +94,14 @@ class BoardViews:
         # and by half the board's size times the error of its own rotation.
         half, radius = float(np.nanmin(tangents)), 0.5 * board_size_m(cell.target)
         full = radius / half
-        near, far = _NEAREST * full, 6.0 * full
+        # Range of distances, relative to that at which the print's half diagonal fills the image's
+        # half short side.
+        near, far = 0.75 * full, 6.0 * full
         for d in np.linspace(full, far, 60):
             turned = cell.sigma_rad * np.hypot(d, radius)
             # Errors of 2.2 standard deviations.
             if half * d > radius + 2.2 * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
-                far = max(_FARTHEST * full, 1.15 * float(d))
+                far = max(1.6 * full, 1.15 * float(d))
                 break
         # The board stays in view where it has been observed.
         least, most = cell.observed_distances_m or (np.inf, 0.0)

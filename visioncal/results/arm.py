@@ -17,9 +17,6 @@ from visioncal.robot.thermal import Heating, Kind, ThermalModel
 NOMINAL, FUNCTIONS = "nominal", "functions"
 # Number of standard deviations beyond which a change is significant.
 _SURE = 3.0
-# Times by which a joint of an arm yields more than its stiffest: wrists have gears of a third to a
-# tenth of the size of a shoulder's.
-_WRIST = 5.0
 
 StoredRobot = Annotated[
     Robot, WrittenForm(lambda item: dict(item.document), lambda item, _: Robot.from_document(item))
@@ -290,7 +287,9 @@ class ElasticResult(Section):
     def sigmas(self) -> FloatArray:
         """(n,) standard deviations of these; joints not shown may be as soft as wrists are."""
         shown = [at.compliance_rad_per_nm for at in self.joints if at.stiffness_nm_per_rad]
-        softest = _WRIST * min(shown, default=0.0)
+        # Times by which a joint of an arm yields more than its stiffest: wrists have gears of a
+        # third to a tenth of the size of a shoulder's.
+        softest = 5.0 * min(shown, default=0.0)
         return np.array(
             [
                 joint.sigma_rad_per_nm if joint.determined else max(joint.sigma_rad_per_nm, softest)

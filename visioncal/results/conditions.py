@@ -11,10 +11,6 @@ from visioncal.results.arm import ArmSections
 from visioncal.results.cell import CellResult
 from visioncal.results.lens import CameraResult, sensor_tilt
 
-# Tilt up to which a sensor counts as parallel to its lens [deg]: makers of industrial cameras state
-# 0.2 to 0.6 about each axis (Basler, pilot user's manual, 1.5.2.2), which is 0.8 about both.
-_PARALLEL_DEG = 0.8
-
 
 @dataclass(frozen=True)
 class Condition:
@@ -60,7 +56,10 @@ def _of_lens(lens: CameraResult, camera: str) -> Iterator[Condition]:
     if tilt is None or not lens.estimated:
         return
     sigma_rad = math.hypot(tilt.sigma_rad, tilt.own_rad)
-    if tilt.rad < max(math.radians(_PARALLEL_DEG), 3.0 * sigma_rad):
+    # Tilt up to which a sensor counts as parallel to its lens [deg]: makers of industrial cameras
+    # state 0.2 to 0.6 about each axis (Basler, pilot user's manual, 1.5.2.2), which is 0.8 about
+    # both.
+    if tilt.rad < max(math.radians(0.8), 3.0 * sigma_rad):
         return
     of, deg = f"{camera}: " if camera else "", math.degrees(tilt.rad)
     sigma = f" (sigma {figure(math.degrees(sigma_rad))})"

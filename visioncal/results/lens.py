@@ -23,8 +23,6 @@ from visioncal.vision.lens_field import LensLevels, displacements
 
 # Places of p1 and p2 among Brown's intrinsics.
 _DECENTRING = (6, 7)
-# Sigma of p1 and p2 of lenses whose elements are centred as well as makers can.
-_OWN_DECENTRING = 5e-4
 
 # Steps of central differences [rad], whose truncation is their square.
 _STEP = 1e-5
@@ -265,7 +263,8 @@ def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
     if rad == 0.0:
         return SensorTilt(rad, 0.0)
     along = tilt @ fitted[:2] / rad
-    own_rad = _OWN_DECENTRING * float(np.linalg.norm(along))
+    # Sigma of p1 and p2 of lenses whose elements are centred as well as makers can.
+    own_rad = 5e-4 * float(np.linalg.norm(along))
     if lens.covariance is None:
         return SensorTilt(rad, 0.0, own_rad)
     return SensorTilt(rad, float(np.sqrt(along @ lens.covariance[6:8, 6:8] @ along)), own_rad)

@@ -26,9 +26,8 @@ _SIZES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
 _UNITS = np.array([2e-3] * 3 + [1e-3] * 3)
 YEAR_DAYS = 365.25
 _STEPS_A_YEAR, _DRIFTS = 0.5, 0.2
-# Four entries at least distinguish a drift from a step; changes are looked for as long as they are
-# more probable than not.
-_DRIFT_ENTRIES, _LIKELY, _MOST_CHANGES = 4, 0.5, 6
+# Changes are looked for as long as they are more probable than not.
+_LIKELY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +129,12 @@ def find_changes(
     """
     count, gaps = len(days), np.diff(days) / YEAR_DAYS
     model = _Model(days, values / units, covariances / np.outer(units, units))
-    drifts = _DRIFTS if len(units) > 1 and count >= _DRIFT_ENTRIES else 1e-12
+    # Four entries at least distinguish a drift from a step.
+    drifts = _DRIFTS if len(units) > 1 and count >= 4 else 1e-12
     odds = [drifts, *np.clip(-np.expm1(-_STEPS_A_YEAR * gaps), 1e-6, 0.5)]
     log_odds = np.log(odds) - np.log1p(-np.array(odds))
     is_drift, found = np.arange(count) == 0, dict[int, float]()
-    while len(found) < min(_MOST_CHANGES, max(1, count // 2)):
+    while len(found) < min(6, max(1, count // 2)):
         gains, sizes = model.gains(found)
         scores = np.where(np.isin(np.arange(count), [*found]), -np.inf, log_odds + gains)
         # A step's probability is that of one at any time.

@@ -20,10 +20,6 @@ from visioncal.robot.model import REPEATABILITY
 # A gap is an interval over this multiple of the usual one, and over this time [s]; and any over the
 # longest, in which a robot can go anywhere.
 GAP_RATIO, SHORT_GAP_S, LONGEST_GAP_S = 2.5, 0.02, 0.25
-# No arm leaves a stop and is back at it within this time [s].
-_AWAY_S = 2.0
-# Least time over which velocities are averaged, to limit the noise of reported poses [s].
-_SPEED_S = 0.04
 # Samples of the cubic, relative to the one before a time.
 _NODES = np.arange(-1, 3)
 
@@ -69,7 +65,8 @@ class Samples:
         steps = np.diff(self.stamps_s)
         limit_s = max(GAP_RATIO * self.step_s, SHORT_GAP_S)
         joined = (steps <= limit_s) & (steps < LONGEST_GAP_S)
-        return np.asarray(joined | (self._unmoved & (steps < _AWAY_S)))
+        # No arm leaves a stop and is back at it within this time [s].
+        return np.asarray(joined | (self._unmoved & (steps < 2.0)))
 
     @cached_property
     def _unmoved(self) -> Mask:
@@ -99,7 +96,8 @@ class Trajectory(Samples):
     @property
     def speed_window_s(self) -> float:
         """Time over which velocities are averaged [s]."""
-        return max(2.0 * self.step_s, _SPEED_S)
+        # Least time over which velocities are averaged, to limit the noise of reported poses [s].
+        return max(2.0 * self.step_s, 0.04)
 
     @cached_property
     def _unmoved(self) -> Mask:

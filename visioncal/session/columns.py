@@ -59,8 +59,6 @@ _SIZES: Mapping[str, tuple[float, str]] = {
     "n": (25_000.0, "{0:g} N is beyond every force on a robot's flange; write newtons"),
 }
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
-# Limit in other columns, so that squares and products do not overflow.
-_LARGEST = 1e60
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -89,7 +87,8 @@ def column_of(name: str) -> Column:
             "and not in kelvin"
         )
         return Column(name, -60.0, 200.0, words.format)
-    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is beyond every number of a cell"))
+    # Limit in other columns, so that squares and products do not overflow.
+    most, words = _SIZES.get(unit, (1e60, "{0:g} is beyond every number of a cell"))
     return Column(name, -most, most, words.format)
 
 

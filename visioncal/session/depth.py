@@ -26,8 +26,6 @@ _PLY = {
     **dict.fromkeys(("int", "int32"), "i4") | dict.fromkeys(("uint", "uint32"), "u4"),
     **dict.fromkeys(("float", "float32"), "f4") | dict.fromkeys(("double", "float64"), "f8"),
 }
-# Farther than any camera of a cell measures [m]: clouds with such a median are in millimetres.
-_FARTHEST_M = 30.0
 
 
 def read_depth(
@@ -143,7 +141,8 @@ def read_cloud(data: bytes, path: str) -> FloatArray:
     is_valid = np.isfinite(points).all(axis=-1) & (points != 0.0).any(axis=-1)
     if not is_valid.any():
         raise DataError(f"{path} holds no point: all are NaN or 0.", culprits=[path])
-    unit_m = 1.0 if np.median(np.abs(points[..., 2][is_valid])) < _FARTHEST_M else 0.001
+    # Farther than any camera of a cell measures [m]: clouds with such a median are in millimetres.
+    unit_m = 1.0 if np.median(np.abs(points[..., 2][is_valid])) < 30.0 else 0.001
     return np.where(is_valid[..., None], points * unit_m, np.nan)
 
 

@@ -22,8 +22,6 @@ _REST_S = 0.25
 # has to differ from the others by this [rad, m].
 _SLOW_SHARE, _ENOUGH_VIEWS, _MOST_VIEWS = 0.5, 20, 200
 _NEW_RAD, _NEW_M = np.deg2rad(2.0), 0.01
-# Lever that makes speeds of rotation and translation comparable [m].
-_LEVER_M = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +120,8 @@ def slow_and_new(poses: FloatArray, speeds: FloatArray) -> IntArray:
         (k,) the moments, ascending.
     """
     speed = np.linalg.norm(speeds[:, :3], axis=1)
-    speed = speed + np.linalg.norm(speeds[:, 3:], axis=1) / _LEVER_M
+    # Lever that makes speeds of rotation and translation comparable [m].
+    speed = speed + np.linalg.norm(speeds[:, 3:], axis=1) / 0.3
     chosen: list[int] = []
     limit = float(np.quantile(speed, _SLOW_SHARE))
     for at in np.argsort(speed, kind="stable"):

@@ -48,16 +48,13 @@ def session_text(path: Path) -> str:
         raise DataError(message, culprits=error.culprits, next_step=step) from error
 
 
-# Arrays of so many bytes together may be pictures; poses take some thousands.
-_PICTURES_BYTES = 1_000_000
-
-
 def _may_hold_images(folder: Path, endings: set[str]) -> bool:
     """Whether files of other kinds may hold pictures: recordings, or arrays of many bytes."""
     others = endings & {*_HOLDING_IMAGES}
     arrays = [file for file in islice(folder.rglob("*.npz"), 999) if file.is_file()]
     size = sum(file.stat().st_size for file in arrays)
-    return bool(others - {".npz"}) or size > _PICTURES_BYTES
+    # Arrays of so many bytes together may be pictures; poses take some thousands.
+    return bool(others - {".npz"}) or size > 1_000_000
 
 
 def _conversion_of(path: Path) -> str:

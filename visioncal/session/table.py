@@ -22,8 +22,6 @@ MOST_VIEWS = 20_000
 # Columns that observe without an image.
 _OBSERVED = ("cft_x_m", "meas_x_m")
 _CENTRE, _FORCE = cols.LOAD[1:4], cols.LOAD[4:]
-# Poses of robot and camera that agree so are one's; a robot moves by more.
-_SAME_M, _MOVED_M = 1e-6, 1e-3
 # Approach direction of the joints to a stop, by the cells of column approach.
 SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
 
@@ -160,14 +158,15 @@ def check_two_sides(name: str, views: Sequence[View], next_step: str) -> None:
     robot, camera = (
         np.array([poses[number] for number in paired_numbers]) for poses in (reported, given)
     )
-    if np.ptp(robot[:, :3, 3], axis=0).max() < _MOVED_M:
+    if np.ptp(robot[:, :3, 3], axis=0).max() < 1e-3:
         return
     places, inverse = robot[:, :3, 3], invert(robot)[:, :3, 3]
     seen, turned = camera[:, :3, 3], invert(camera)[:, :3, 3]
     # The rotations may be the same numbers in another form.
     pairs = ("the same", places - seen), ("inverse", places - turned), ("inverse", inverse - seen)
     for how, away in pairs:
-        if np.abs(away).max() < _SAME_M:
+        # Poses of robot and camera that agree so are one's; a robot moves by more.
+        if np.abs(away).max() < 1e-6:
             raise DataError(
                 f"{name}: the poses of the robot and those of the camera are {how} in all "
                 f"{len(robot)} rows: the numbers of one serve as both, and say nothing of the "

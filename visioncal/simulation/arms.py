@@ -64,8 +64,6 @@ BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
     ),
 }
 JOINTS = 6
-# Stroke of a joint that slides [m].
-STROKE_M = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +264,8 @@ def arm_named(name: str) -> DhArm:
 def drawn_postures(arm: DhArm, count: int, rng: np.random.Generator) -> FloatArray:
     """(count, n) random postures: angles up to 2.5 rad, and strokes [m]."""
     q = rng.uniform(-2.5, 2.5, (count, arm.a.size))
-    q[:, arm.slides] = STROKE_M * (0.5 + q[:, arm.slides] / 5.0)
+    # Stroke of a joint that slides [m].
+    q[:, arm.slides] = 0.2 * (0.5 + q[:, arm.slides] / 5.0)
     return q
 
 

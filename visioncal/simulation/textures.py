@@ -15,8 +15,8 @@ from visioncal.vision.targets import extent_m
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
 _INK, _PAPER, _PLATE = 30, 222, 152
-# Margins around the print in sides of a square: white paper, its plate, the plate's shadow.
-_PAPER_MARGIN, _PLATE_MARGIN, _SHADOW_MARGIN = 0.55, 0.85, 1.35
+# Margin around the print with its shadow, in sides of a square.
+_SHADOW_MARGIN = 1.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +47,12 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
     width, height = np.ceil(np.round((high - low) / finest, 6)).astype(int).tolist()
     margin = 2 * int(np.ceil(0.5 * _SHADOW_MARGIN * texels))
     grey = np.full((height + 2 * margin, width + 2 * margin), _PLATE, np.uint8)
-    paper = margin - round(_PAPER_MARGIN * texels)
+    # White paper and its plate around the print, in sides of a square.
+    paper = margin - round(0.55 * texels)
     grey[paper:-paper, paper:-paper] = _PAPER
     light = light_of(target, low, finest, (height, width))
     grey[margin:-margin, margin:-margin] = np.rint(_INK + (_PAPER - _INK) * light)
-    plate = margin - round(_PLATE_MARGIN * texels)
+    plate = margin - round(0.85 * texels)
     # Coverage: 255 on the plate, fading in the shadow around it, which is computed at low
     # resolution, as it is smooth.
     factor = max(texels // 16, 1)

@@ -22,11 +22,6 @@ from visioncal.verification.model_evidence import CalibrationPosterior, Repeated
 from visioncal.vision.board_shape import boards_basis, stated_board_sigma
 from visioncal.vision.targets import numbered_positions, target_from_document
 
-# Correlation of the arm's errors from which a stop repeats a calibrated one.
-_REPEATED = 0.5
-# Views that were left out without a cause are errors of the arm, which come again, from this number
-# and this share on; fewer are mistakes of rows.
-_FEWEST_STRAYS, _SHARE_OF_STRAYS = 3, 0.1
 # Findings whose views are left out without a cause.
 _NO_CAUSE = ("wrong_views", "lost_views", "unexplained")
 
@@ -135,7 +130,9 @@ class CalibrationPrior:
         ]
         count = sum(view.used for view in views) + len(strays)
         is_of_arm = self.calibration.arm_errors is not None
-        if not is_of_arm or len(strays) < max(_FEWEST_STRAYS, _SHARE_OF_STRAYS * count):
+        # Views that were left out without a cause are errors of the arm, which come again, from
+        # this number and this share on; fewer are mistakes of rows.
+        if not is_of_arm or len(strays) < max(3, 0.1 * count):
             return deg, mm
         share, squares = 1.0 - len(strays) / count, np.square(strays).sum(axis=0) / (3.0 * count)
         stray = np.sqrt(share * np.square((deg, mm)) + squares)
@@ -167,7 +164,8 @@ class CalibrationPrior:
         alike = np.where(boards[:, None] == np.array(calibrated.boards), 1.0, 0.0)
         near = alike * correlation[:count, count:]
         nearest = near.argmax(axis=1)
-        repeating = np.flatnonzero(near.max(axis=1) > _REPEATED)
+        # Correlation of the arm's errors from which a stop repeats a calibrated one.
+        repeating = np.flatnonzero(near.max(axis=1) > 0.5)
         chosen, first = np.unique(nearest[repeating], return_index=True)
         if not len(chosen):
             return None

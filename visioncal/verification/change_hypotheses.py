@@ -40,15 +40,11 @@ _FOCUS_SHARES, _WARMTH_SHARES = (1e-3, 1e-2, 1e-1), (1e-4, 3e-4, 1e-3)
 _KNOCKS = (np.ones(6), np.repeat([0.1, 1.0], 3))
 # Two simultaneous changes.
 PAIRS = (BOTH, REPLACED)
-# Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
-_OTHER_SIZE_PER_M = 10.0
-# Shares by which a lens grows: whose motions are proportional, and from which on it is another one.
-_SMALL_SHARE, _LARGE_SHARE = 1e-3, 0.5
+# Share by which a lens grows whose motions are proportional.
+_SMALL_SHARE = 1e-3
 # Displacement from which on a board is not in place, as by a millimetre and 4 mrad for each of
-# these [m]; and unit of a change that is one or none.
-_FAR_M, _WHOLE = 5e-3, 10.0
-# Joints that a load reaches by a smaller share of its greatest torque do not bend.
-_LEAST_SHARE = 0.01
+# these [m].
+_FAR_M = 5e-3
 # Units of a twist, for a change of one metre.
 MOTION_UNITS: FloatArray = np.repeat([TURN_PER_M, 1.0], 3)
 
@@ -87,7 +83,8 @@ def causes_of(
         by_place = np.where(shown[:, None, None], -np.eye(6), 0.0)
         start, name = log(mean_transform(away[shown])), f"{BOARD} {names[index]}".strip()
         place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at, shapes=_KNOCKS)
-        other = replace(size, units=np.array([_OTHER_SIZE_PER_M]))
+        # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
+        other = replace(size, units=np.array([10.0]))
         causes += [place, _simultaneous(REPLACED, place, other)]
         # Camera and board together fit any two stops.
         if len(prior.boards) == 1 and predicted.stops >= FEWEST_VIEWS:
@@ -133,7 +130,8 @@ def _focal_length(predicted: PredictedStops, changes: FloatArray) -> Iterator[Ch
 
     small = undoing(_SMALL_SHARE)
     share = -float(np.sum(small[:, :, 0] * changes) / np.sum(small**2))
-    is_small = not _SMALL_SHARE < abs(share) < _LARGE_SHARE
+    # From the larger share on it is another lens.
+    is_small = not _SMALL_SHARE < abs(share) < 0.5
     # Large ones bend.
     by_share, share = (small, 0.0) if is_small else (undoing(share), share)
     yield ChangeHypothesis(
@@ -192,7 +190,8 @@ def _load(
     greatest = np.abs(torques).max(axis=0)
     if not greatest.any():
         return
-    bent = greatest > _LEAST_SHARE * greatest.max()
+    # Joints that a load reaches by a smaller share of its greatest torque do not bend.
+    bent = greatest > 0.01 * greatest.max()
     # Joints of about equal stiffness.
     by_flange = (offsets * (torques / greatest.max())[:, None, :])[:, :, bent]
     units = np.full(int(bent.sum()), TURN_PER_M)
@@ -243,7 +242,8 @@ def _pairing(
     by_sensor = np.zeros((len(problem), 6, 1 + 6 * len(lost)))
     undone = invert(away[stops[moved], moved]) @ away[nearest[moved], moved]
     by_sensor[moved, :, 0] = log(undone)
-    start, units = np.ones(1), np.full(1, _WHOLE)
+    # Unit of a change that is one or none.
+    start, units = np.ones(1), np.full(1, 10.0)
     if len(lost):
         by_sensor[lost[0], :, 1:] = -np.eye(6)
         start = np.append(start, changes[lost[0]])

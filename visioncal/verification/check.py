@@ -39,10 +39,6 @@ from visioncal.verification.model_evidence import (
 from visioncal.verification.prediction import PredictedStops, board_changes, predict_stops
 
 _LIMITS = CheckLimits()
-# Prior sigma of a board that was moved on purpose, around where it is seen [rad and m].
-_ANYWHERE = 1.0
-# Greatest share by which an arm grows, four times as by 100 K of aluminium.
-_MOST_GROWTH = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +57,8 @@ class PossibleChange:
     @property
     def is_possible(self) -> bool:
         """Whether an arm can have grown by so much, where that is the change."""
-        return self.cause.kind != LENGTH or abs(self.explained.values[0]) < _MOST_GROWTH
+        # Greatest share by which an arm grows, four times as by 100 K of aluminium.
+        return self.cause.kind != LENGTH or abs(self.explained.values[0]) < 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +186,8 @@ def check(
         seen = replace(prior.state, edges=np.stack([x, z @ mean_transform(predicted.away(prior))]))
         covariance = prior.covariance.copy()
         covariance[6:12], covariance[:, 6:12] = 0.0, 0.0
-        covariance[6:12, 6:12] = _ANYWHERE**2 * np.eye(6)
+        # Prior sigma of a board that was moved on purpose, around where it is seen [rad and m].
+        covariance[6:12, 6:12] = np.eye(6)
         prior, boards = replace(prior, state=seen, covariance=covariance), None
     belief = prior.belief(problem, boards)
     causes = causes_of(predicted, prior, board_placed_anew=board_placed_anew)

@@ -40,8 +40,6 @@ from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import first_corners
 
 NONE = "none of these"
-# Share of the arm's error, in variance, that counts as noise of the look in any case.
-_NEW = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -337,12 +335,13 @@ class Guard:
         by_edges, by_values = jacobian[:, :edges], jacobian[:, edges:]
         by_arm = linear.by_errors[0] * np.repeat(self._noise.robots[0], 3)
         by_arm = by_arm @ by_arm.T
+        # Share of the arm's error, in variance, that counts as noise of the look in any case.
         return LookRows(
             time_s=look.time_s,
             residual=linear.residuals[0],
             covariance=problem.total_covariance(linear, self._noise)[0]
             + by_values @ self._rest @ by_values.T
-            - (1.0 - _NEW) * by_arm,
+            - (1.0 - 0.1) * by_arm,
             by_edges=by_edges + by_values @ self._gain,
             by_motion=by_edges,
             by_joints=-linear.by_flanges[0] @ offsets,

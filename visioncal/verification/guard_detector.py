@@ -37,8 +37,6 @@ from visioncal.core.transforms import LEVER_M
 from visioncal.core.types import FloatArray
 from visioncal.robot.errors import SIZES_M
 
-# Candidates for the look of the change, and the looks after which one is given up.
-_CANDIDATES, _OLDEST = 14, 1000
 # Sizes of changes, as the mean squared shift of one look in units of its noise. Larger ones are
 # found as soon, as looks have a bounded influence.
 _SHIFTS = np.array([0.1, 0.6, 4.0])
@@ -46,8 +44,6 @@ _SHIFTS = np.array([0.1, 0.6, 4.0])
 _SHOWN = 1e-3
 # Prior size of a change in its estimate, and of one that is acknowledged [m]: hardly any.
 _WIDEST_M = 0.1
-# Share of the arm's error that is new, at first.
-_FRESH = 0.4
 # Squared length of an innovation that noise exceeds in one look of a hundred: the largest that
 # counts in full.
 _FAR = float(chi2_limit(0.01, 6))
@@ -56,17 +52,13 @@ _WRONG = 60.0
 # Rotation [rad] and distance [m] of a residual beyond which its rows say nothing, and the log
 # likelihood ratio of such a look, and inverse of any other, after a change of that size to none.
 _BEYOND, _LOG_BEYOND = np.array([0.5, 1.0]), float(np.log(200.0))
-# Looks by which the noise is known at first, after which it is forgotten, and its proportions.
-_STATED, _MEMORY, _SOON = 200.0, 3000.0, 1000.0
+# Looks by which the noise is known at first.
+_STATED = 200.0
 # Small limits of the statistic; the looks by which it is known at first that each is passed as
 # often as it should be, and those that are remembered.
 _LEVELS, _SUPPOSED, _REMEMBERED = np.array([20.0, 200.0]), 2000.0, 20_000.0
-# Least exponent of the tail: with a smaller one hardly anything would be an alarm.
-_TAIL = 0.4
-# Postures that are kept, and the distance within which they are one [rad, and 2 rad a metre].
-_PLACES, _SAME = 64, 0.05
-# Smallest slow motion [m, and radians], and the squared forecast that is supposed at first.
-_LEAST_M, _WEAK = 3e-6, 0.1
+# Postures that are kept.
+_PLACES = 64
 # Time constant of slow motions [s]: of hours, and fast enough for the day's.
 _SLOW_S = 6 * 3600.0
 
@@ -146,10 +138,12 @@ class Detector:
         covariance[:count, :count] = edges
         shapes = ((_PLACES, 12), _PLACES, (_PLACES, 6), (_PLACES, 6, 6), (changes, changes))
         candidates = ((4,), (size, changes), *((changes, changes), (changes,)) * 2, (), (), ())
+        # Share of the arm's error that is new, at first. Squared forecast that is supposed at
+        # first.
         return cls(
             *(np.zeros(()), np.zeros(()), np.zeros(size), covariance, np.eye(6)),
-            *(np.array(_FRESH), slow**2),
-            np.full(count // 6, _WEAK),
+            *(np.array(0.4), slow**2),
+            np.full(count // 6, 0.1),
             *(np.zeros(shape) for shape in shapes),
             *(np.zeros((0, *shape)) for shape in candidates),
         )
@@ -189,7 +183,8 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     for name in CANDIDATE[1:]:
         held = getattr(state, name)
         grown[name] = np.concatenate([held, np.zeros((int(is_learning), *held.shape[1:]))])
-    if len(grown["born"]) > _CANDIDATES:
+    # Candidates for the look of the change.
+    if len(grown["born"]) > 14:
         _thin(grown, count)
     follows = motion[:, None] * grown["follows"]
     is_beyond = bool((np.linalg.norm(rows.residual.reshape(2, 3), axis=1) > _BEYOND).any())
@@ -240,9 +235,10 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     if is_learning:
         # Of the noise in units of the stated: expectation and maximisation (Shumway and Stoffer
         # 1982), look by look. Of the arm's share and the slow motions: what innovations have too
-        # much or too little of (Robbins and Monro 1951).
-        often = 1.0 / min(_STATED + count, _MEMORY)
-        soon = 1.0 / min(0.5 * (_STATED + count), _SOON)
+        # much or too little of (Robbins and Monro 1951). Looks after which the noise is forgotten,
+        # and its proportions.
+        often = 1.0 / min(_STATED + count, 3000.0)
+        soon = 1.0 / min(0.5 * (_STATED + count), 1000.0)
         of_noise, stated = whiten @ part, np.linalg.inv(root)
         found = of_noise.T @ clipped
         moment = stated @ (np.outer(found, found) + part - of_noise.T @ of_noise) @ stated.T
@@ -250,11 +246,12 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
         more = clipped @ arm @ clipped / max(np.trace(arm), 1e-12) - 1.0
         power = state.forecast + often * (np.sum(forecast**2, axis=0) - state.forecast)
         larger = forecast.T @ clipped / power
+        # Smallest slow motion [m, and radians].
         learned = {
             "shape": state.shape + often * (0.5 * (moment + moment.T) - state.shape),
             "fresh": state.fresh * np.exp(soon * more),
             "forecast": power,
-            "slow": np.maximum(state.slow * np.exp(soon * np.repeat(larger, 6)), _LEAST_M**2),
+            "slow": np.maximum(state.slow * np.exp(soon * np.repeat(larger, 6)), 3e-6**2),
             "usual": state.usual + (products[-1] - state.usual) / min(count + 1.0, 5e3),
         }
     return replace(state, **now, mean=mean, covariance=covariance, **grown, **places, **learned)
@@ -266,7 +263,8 @@ def _place(state: Detector, rows: LookRows) -> tuple[int, dict[str, FloatArray]]
     places = {name: getattr(state, name).copy() for name in names}
     away = np.linalg.norm(state.postures - rows.posture, axis=1) + 1e9 * (state.stood == 0)
     at = int(away.argmin())
-    if away[at] > _SAME:
+    # Distance within which postures are one [rad, and 2 rad a metre].
+    if away[at] > 0.05:
         at = int(state.stood.argmin())
         for name, value in zip(names, (rows.posture, 0.0, 0.0, rows.by_arm), strict=True):
             places[name][at] = value
@@ -289,7 +287,8 @@ def _thin(grown: dict[str, FloatArray], looks: float) -> None:
     """Gives up the oldest candidate, or the one whose neighbours are nearest for their age."""
     born, ages = grown["born"], looks + 1.0 - grown["born"][:, 0]
     at = 0
-    if ages[0] <= _OLDEST:
+    # Looks after which a candidate is given up.
+    if ages[0] <= 1000:
         at = 1 + int(np.argmin((ages[:-2] - ages[2:]) / ages[1:-1]))
         born[at + 1, 1], born[at + 1, 3] = born[at, 1], born[at + 1, 3] + born[at, 3]
     for name in CANDIDATE:
@@ -358,7 +357,8 @@ def limit(state: Detector, looks: float) -> float:
     """The statistic's limit that is passed once in so many looks, in the mean, by no change."""
     rates = state.passed[1]
     tail = np.log(rates[0] / rates[1]) / np.log(_LEVELS[1] / _LEVELS[0])
-    return float(_LEVELS[1] * (looks * rates[1]) ** (1.0 / max(tail, _TAIL)))
+    # Least exponent of the tail: with a smaller one hardly anything would be an alarm.
+    return float(_LEVELS[1] * (looks * rates[1]) ** (1.0 / max(tail, 0.4)))
 
 
 def estimate(

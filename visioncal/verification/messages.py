@@ -40,12 +40,6 @@ from visioncal.verification.check import Check, PossibleChange
 from visioncal.verification.triggers import Trigger
 from visioncal.vision.targets import corner_positions
 
-# Thermal expansion of aluminium and steel, in shares a kelvin.
-_ALUMINIUM, _STEEL = 23e-6, 12e-6
-# Changes of a smaller probability are not listed.
-_LISTED_SHARE = 1e-3
-# A mount that gives way farther hangs, and another tool of the controller is mostly farther away.
-_LOOSE_MM, _LOOSE_DEG = 20.0, 5.0
 _OR_TOOL = ", or another tool was active in the controller"
 _OR_JOINT = ", or a joint slipped, as rows with joint angles (q1_rad ...) would show"
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
@@ -229,6 +223,7 @@ def change_words(check: Check, change: PossibleChange) -> str:
     found, robot = _estimates(check, change), check.calibration.calibrated_robot
     share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
     has_joints = any(other.cause.kind == JOINT for other in check.compared)
+    # Thermal expansion of aluminium and steel, in shares a kelvin.
     facts = {
         "or_frame": _or_frame(check, change, found),
         "or_joint": "" if has_joints else _OR_JOINT,
@@ -240,8 +235,8 @@ def change_words(check: Check, change: PossibleChange) -> str:
         "longer": "longer" if share > 0.0 else "shorter",
         "percent": figure(1e2 * abs(share)),
         "sigma": figure(1e2 * sigma),
-        "aluminium": abs(share) / _ALUMINIUM,
-        "steel": abs(share) / _STEEL,
+        "aluminium": abs(share) / 23e-6,
+        "steel": abs(share) / 12e-6,
         "factor": found.get("noise_factor", 1.0),
         "pairs": _pair_words(change.cause.pairs),
         "load": _load_words(check),
@@ -265,8 +260,9 @@ def _or_frame(check: Check, change: PossibleChange, move: Mapping[str, Any]) -> 
         return ""
     if not _is_carried(check, is_camera):
         return ", or the robot's base was pushed"
-    # Where the arm was calibrated, joint angles say where the flange is.
-    is_far = move["moved_mm"] > _LOOSE_MM or move["turned_deg"] > _LOOSE_DEG
+    # Where the arm was calibrated, joint angles say where the flange is. A mount that gives way
+    # farther hangs, and another tool of the controller is mostly farther away.
+    is_far = move["moved_mm"] > 20.0 or move["turned_deg"] > 5.0
     return _OR_TOOL if is_far and check.prior.model is None else ""
 
 
@@ -484,7 +480,8 @@ def to_document(
 def listed_changes(check: Check) -> tuple[PossibleChange, ...]:
     """Changes to list: those that are named, and others that are not unlikely."""
     others = (change for change in check.compared if change not in check.named)
-    return (*check.named, *(other for other in others if other.probability > _LISTED_SHARE))
+    # Changes of a smaller probability are not listed.
+    return (*check.named, *(other for other in others if other.probability > 1e-3))
 
 
 def _change(check: Check, change: PossibleChange) -> dict[str, Any]:

@@ -34,11 +34,6 @@ from visioncal.robot.errors import SIZES_M
 
 # Shares of the noise's variance that are new at a repeated posture: sigmas are halved in each step.
 _NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))
-# Repeatability of well-kept arms [m], and the factor by which others differ from it: the log-normal
-# prior of what is new.
-_REPEATABILITY_M, _FACTOR = 3e-5, 2.0
-# Far below any arm's repeatability.
-_CONVERGED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +108,9 @@ def evidence_of(
     cause = cause or ChangeHypothesis("nothing", np.zeros(0))
     shares = (1.0,) if belief.repeated is None else _NEW_SHARES
     new_m = max(belief.noise.robots[0, 1], LEAST_SIGMA) * np.sqrt(shares)
-    log_priors = -0.5 * (np.log(new_m / _REPEATABILITY_M) / np.log(_FACTOR)) ** 2
+    # Repeatability of well-kept arms [m], and the factor by which others differ from it: the log-
+    # normal prior of what is new.
+    log_priors = -0.5 * (np.log(new_m / 3e-5) / np.log(2.0)) ** 2
     log_priors -= np.logaddexp.reduce(log_priors) + np.log(len(cause.noise_factors))
     prior_of = dict(zip(shares, log_priors.tolist(), strict=True))
     sizes_m = cause.sizes_m if len(cause.units) else cause.sizes_m[:1]
@@ -127,7 +124,8 @@ def evidence_of(
             key=lambda trial: variants[trial].score(widest, belief.freedom) + prior_of[trial[1]],
         )
         before, values = values, variants[likeliest].posterior(widest)[0]
-        if np.abs(values - before).max(initial=0.0) < _CONVERGED:
+        # Far below any arm's repeatability.
+        if np.abs(values - before).max(initial=0.0) < 1e-7:
             break
     scores = [
         variant.score(size_m * shape * cause.units, belief.freedom) + prior_of[share]

@@ -28,8 +28,6 @@ from visioncal.vision.corners import CornerStack, reproject
 from visioncal.vision.lens_field import depths_m
 from visioncal.vision.targets import numbered_positions, target_document
 
-# Models whose flanges move alike to this [m and rad] are of the same robot: tables have six digits.
-_ONE_ROBOT = 1e-5
 # Next step for readings of an instrument, which are not verified stop by stop.
 COMPARED = "Calibrate the new session, and compare both results with visioncal diff."
 _STAGES = {stage.name: stage.run for stage in STAGES}
@@ -289,7 +287,9 @@ def check_robot(session: Session, stated: Robot, calibrated: Robot, *others: Rob
             # Motions are compared: the calibrated base may have been moved to the poses' frame.
             model_poses, stated_poses = (robot.base_from_flange(q) for robot in (model, stated))
             between = [invert(array[0]) @ array for array in (model_poses, stated_poses)]
-            if np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT:
+            # Models whose flanges move alike to this [m and rad] are of the same robot: tables have
+            # six digits.
+            if np.abs(log(invert(between[0]) @ between[1])).max() < 1e-5:
                 return
     raise DataError(
         f"session {session.name!r} names robot {stated.name}, which moves its flange otherwise: it "

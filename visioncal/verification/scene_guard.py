@@ -32,10 +32,6 @@ from visioncal.vision.scene import Registration, nothing, register
 # Sizes of changes, as sigmas of each component in those of a look: larger ones are found as soon,
 # as a look's length is bounded.
 _SIZES = np.array([0.3, 1.0])
-# Inverse mean of the statistic over its limit at false alarms, in simulation.
-_OVERSHOOT = 0.6
-# Probability of a longer look by noise alone.
-_RARE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +90,16 @@ class SceneWatch:
         expected = known @ np.einsum("kij,kj->i", weights, self._turns[earlier])
         off, spread, size = turn / self._unit - expected, noise + known, len(turn)
         length2 = max(float(off @ np.linalg.solve(spread, off)), 1e-12)
-        # One look may be of a thing that moved: however far off it is, it is bounded.
-        bound = float(chi2_limit(_RARE, size))
+        # One look may be of a thing that moved: however far off it is, it is bounded. Probability
+        # of a longer look by noise alone.
+        bound = float(chi2_limit(0.01, size))
         off *= min(1.0, float(np.sqrt(bound / length2)))
         self._sizes = np.append(self._sizes, np.linalg.det(noise) ** (0.5 / size))
         self._groups = np.append(self._groups, group)
         self._turns = np.concatenate([self._turns, [expected + off]])
         self._weights = np.concatenate([self._weights, [weight]])
-        self.evidence = self._statistic() / (_OVERSHOOT * self._limit)
+        # Inverse mean of the statistic over its limit at false alarms, in simulation.
+        self.evidence = self._statistic() / (0.6 * self._limit)
         self.holds = self.holds and self.evidence < 1.0
 
     def _statistic(self) -> float:

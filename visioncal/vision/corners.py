@@ -21,8 +21,6 @@ from visioncal.vision.viewnoise import weights_by_view
 
 # Least ratio of noise to what is stated that counts: the rounding of a statement of one digit.
 _ROUNDED = 1.3
-# Corners whose modes of a field are held at once.
-_BLOCK = 2048
 # Distance outside the image from which on corners are none, as a share of its size.
 _OUTSIDE = 0.1
 # Exact corners have no noise; a millionth of a pixel keeps their covariance positive definite.
@@ -194,7 +192,8 @@ class CornerStack:
     def blocks(self) -> Iterator[tuple[slice, slice]]:
         """Slices of some thousand corners each, and of their views."""
         count = len(self.starts)
-        step = max(_BLOCK * count // max(len(self.px), 1), 1)
+        # Corners whose modes of a field are held at once.
+        step = max(2048 * count // max(len(self.px), 1), 1)
         ends = np.append(self.starts, len(self.px)).tolist()
         for first in range(0, count, step):
             last = min(first + step, count)

@@ -27,8 +27,6 @@ from visioncal.vision.targets import corner_positions, extent_m
 
 # Texels of a square or of the distance of corners, and white paper around the print [squares].
 _TEXELS, _PAPER = 24, 0.5
-# Side of a square that images are reduced to [px]: a blur of such a share leaves nothing finer.
-_SQUARE_PX = 16.0
 # Least share of the variance that a board explains, as another one's markers or rim differ, and of
 # its pixels that are free.
 _EXPLAINED, _SHOWN = 0.9, 0.3
@@ -68,7 +66,9 @@ def find_densely(
     for lens, pose, lens_sigma in chain(first, _starts(image, target)):
         depth_m = float(drawn.middle_at(pose)[2])
         side_px = side_m * float(lens.matrix[:2].mean()) / depth_m
-        factor = max(1, round(side_px / _SQUARE_PX))
+        # Side of a square that images are reduced to [px]: a blur of such a share leaves nothing
+        # finer.
+        factor = max(1, round(side_px / 16.0))
         # A few pixels of a pose that is known from elsewhere are few of the coarsest copy.
         factors = (4 * factor, 2 * factor, factor)[lens_sigma is not None :]
         fits = [

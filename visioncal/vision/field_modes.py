@@ -8,8 +8,8 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray
 
-# Grid points per axis for the modes, and the share of the field's variance they keep.
-_POINTS, _KEPT = 64, 0.999
+# Share of the field's variance that its modes keep.
+_KEPT = 0.999
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,8 @@ def _modes(at: FloatArray, extent: float) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _grid_modes(extent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    grid = np.linspace(0.0, extent, _POINTS)
+    # Grid points per axis.
+    grid = np.linspace(0.0, extent, 64)
     values, vectors = np.linalg.eigh(np.exp(-0.5 * (grid[:, None] - grid) ** 2))
     kept = values > (1.0 - _KEPT) ** 2 * values[-1]
     # Fixed signs: stored coefficients are of the same modes on any machine.

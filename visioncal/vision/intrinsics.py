@@ -28,8 +28,6 @@ from visioncal.vision.targets import numbered_positions
 
 # The intrinsics (4 + k,) and the poses (v, 4, 4).
 _State: TypeAlias = tuple[FloatArray, FloatArray]
-# Starts for the focal length, in image widths, where Zhang's own start does not converge.
-_FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +140,8 @@ def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
 def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int]) -> BundleFit:
     """Fits from Zhang's start and further focal lengths until a fit is good."""
     (width, height), fits = resolution, list[BundleFit]()
-    starts = [share * width for share in _FOCAL_WIDTHS]
+    # Starts for the focal length, in image widths, where Zhang's own start does not converge.
+    starts = [share * width for share in (0.3, 0.6, 1.0, 2.0)]
     # Zhang's start takes boards in their plane z = 0.
     if not stack.points[:, 2].any():
         points = np.split(stack.points.astype(np.float32), stack.starts[1:])

@@ -18,10 +18,6 @@ from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.corners import CornerStack
 from visioncal.vision.field_modes import field_modes
 
-# Grid points per axis of the image over which the intrinsics' part is removed, and the relative
-# singular value below which a combination of intrinsics is undetermined there.
-_IMAGE_GRID, _DETERMINED = 20, 1e-8
-
 
 @dataclass(frozen=True)
 class LensLevels:
@@ -42,7 +38,9 @@ def lens_part(camera: Camera, length: float) -> FloatArray:
     The modes along x come first, then those along y. A random field must be orthogonal to the fixed
     columns beside it (Hodges and Reich 2010).
     """
-    axes = (np.linspace(0.0, size - 1.0, _IMAGE_GRID) for size in camera.resolution)
+    # Grid points per axis of the image over which the intrinsics' part is removed, and the relative
+    # singular value below which a combination of intrinsics is undetermined there.
+    axes = (np.linspace(0.0, size - 1.0, 20) for size in camera.resolution)
     px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     rays = normalise(camera, px)
     seen = np.isfinite(rays).all(axis=1)
@@ -50,7 +48,7 @@ def lens_part(camera: Camera, length: float) -> FloatArray:
     flat = np.concatenate(project_with_jacobian(camera, points).jacobian_intrinsics)
     scale = np.linalg.norm(flat, axis=0)
     scale[scale == 0.0] = 1.0
-    inverse = np.linalg.pinv(flat / scale, rcond=_DETERMINED) / scale[:, None]
+    inverse = np.linalg.pinv(flat / scale, rcond=1e-8) / scale[:, None]
     by_axis = inverse.reshape(len(scale), -1, 2)
     modes = field_modes(px, camera.resolution, length).at(slice(None))
     return np.concatenate([by_axis[:, :, 0] @ modes, by_axis[:, :, 1] @ modes], axis=1)

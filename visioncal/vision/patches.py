@@ -15,12 +15,8 @@ from visioncal.core.types import Camera, FloatArray, Image, IntArray
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.register.fit import Registered
 
-# Side of the blocks within a patch whose errors go together [px], and fewest pixels of a patch.
-_BLOCK_PX, _FEWEST = 6, 60
-# Least share of a patch's pixels that is free: what covers a third has a shadow, too.
-_FREE = 0.65
-# Largest ratio of a patch's sigmas: of parallel lines, the other is noise of the model.
-_LONGEST = 4.0
+# Side of the blocks within a patch whose errors go together [px].
+_BLOCK_PX = 6
 
 
 def places_of(
@@ -58,12 +54,15 @@ def places_of(
         near = (np.abs(at[:, top:bottom, left:right] - place) < half_m).all(axis=0)
         inside = numbers[top:bottom, left:right][near]
         taken = inside[free[inside] > 0.3]
-        if len(taken) < max(_FEWEST, _FREE * len(inside)):
+        # Fewest pixels of a patch. Least share of a patch's pixels that is free: what covers a
+        # third has a shadow, too.
+        if len(taken) < max(60, 0.65 * len(inside)):
             continue
         patch_columns, weights = columns[:, taken], free[taken].astype(float)
         normal = (patch_columns * weights) @ patch_columns.T
         inverse = np.linalg.inv(normal + 1e-9 * (np.trace(normal) + 1e-9) * np.eye(4))
-        if np.linalg.cond(inverse[:2, :2]) > _LONGEST**2:
+        # Largest ratio of a patch's sigmas: of parallel lines, the other is noise of the model.
+        if np.linalg.cond(inverse[:2, :2]) > 4.0**2:
             continue
         solved = inverse @ (patch_columns * weights) @ residuals[taken]
         rest = residuals[taken] - solved @ patch_columns

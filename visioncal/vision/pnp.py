@@ -20,15 +20,6 @@ from visioncal.vision.targets import (
     rotations,
 )
 
-# The mirrored pose of a planar target stays a candidate while its rms is within this ratio of the
-# better one's: systematic errors of lens and board can change the order up to there.
-_RIVAL_RATIO = 2.0
-# ... or while the difference in squared error is within 6 sigma.
-_RIVAL_CHI2 = 36.0
-# Smaller differences of rotation [rad] are one pose that was reached from both starts, not quite as
-# near where corners are all but exact; poses that are mirrored differ by twice the board's tilt.
-_SAME_RAD = 1e-3
-
 
 @dataclass(frozen=True, eq=False)
 class ViewPoses:
@@ -171,9 +162,15 @@ def _with_rivals(
     poses = np.array([at.cam_from_target for at in fits])[order, each]
     information = np.array([at.information for at in fits])[order, each]
     # Elsewhere the mirrored pose has no minimum of its own, and the fit reaches the first one.
-    differ = np.abs(poses[0] - poses[1])[:, :3, :3].max(axis=(1, 2)) > _SAME_RAD
+    # Smaller differences of rotation [rad] are one pose that was reached from both starts, not
+    # quite as near where corners are all but exact; poses that are mirrored differ by twice the
+    # board's tilt.
+    differ = np.abs(poses[0] - poses[1])[:, :3, :3].max(axis=(1, 2)) > 1e-3
     mahalanobis_sq = stack.counts * (worse - best) / variance
-    rivals = differ & ((worse < _RIVAL_RATIO**2 * best) | (mahalanobis_sq < _RIVAL_CHI2))
+    # The mirrored pose of a planar target stays a candidate while its rms is within this ratio of
+    # the better one's, as systematic errors of lens and board can change the order up to there, or
+    # while the difference in squared error is within 6 sigma.
+    rivals = differ & ((worse < 2.0**2 * best) | (mahalanobis_sq < 36.0))
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
     turns_of = [rotation_transforms(target) for target in targets]

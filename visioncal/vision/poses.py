@@ -15,10 +15,8 @@ from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.vision.camera import normalise
 from visioncal.vision.corners import CornerStack, Reprojection, reproject
 
-# Least points of a homography; relative distance from a line below which points are collinear.
-FEWEST_CORNERS, _ON_LINE = 4, 1e-6
-# Ratio of depth to width below which points count as coplanar.
-_FLAT = 0.1
+# Least points of a homography.
+FEWEST_CORNERS = 4
 # Converged step [rad or m]: the next, some hundred times smaller, is negligible beside any noise.
 _CONVERGED = 1e-6
 
@@ -90,7 +88,8 @@ def _flattened(points: FloatArray) -> FloatArray | None:
         return points
     middle = points.mean(axis=0)
     _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
-    if extents[2] > _FLAT * extents[1]:
+    # Ratio of depth to width below which points count as coplanar.
+    if extents[2] > 0.1 * extents[1]:
         return None
     return np.asarray(points - np.outer((points - middle) @ axes[2], axes[2]))
 
@@ -106,7 +105,8 @@ def determines_pose(points: FloatArray) -> bool:
     along = points[[1, 2, 2]] - starts
     # Called for every view: `np.cross` takes ten times as long.
     distances = np.linalg.norm((points - starts[:, None]) @ skew(along), axis=2)
-    is_off = distances > _ON_LINE * span * np.linalg.norm(along, axis=1)[:, None]
+    # Relative distance from a line below which points are collinear.
+    is_off = distances > 1e-6 * span * np.linalg.norm(along, axis=1)[:, None]
     return bool(np.all(is_off.sum(axis=1) >= 2))
 
 

@@ -21,26 +21,12 @@ from visioncal.core.transforms import apply, exp, invert, log
 from visioncal.core.types import Camera, FloatArray, Image, Mask
 from visioncal.vision.camera import normalise, project_with_jacobian
 
-# Half the side of a patch [px], most patches of an image, about, and blocks along its side whose
-# patches share errors.
-_HALF, _PATCHES, _BLOCKS = 8, 600, 5
-# Smoothing before anything else, against aliasing [px], and the coarsest image's width [px].
-_SMOOTH_PX, _COARSEST_PX = 1.0, 120
-# Least information of a patch on its shift [grey^2/px^2]: 0.3 px in noise of 2 grey levels.
-_TEXTURE = 44.0
-# Share of a patch's variance then that is found now, and its residual variance over the median.
-_ALIKE, _MOST_VARIANCE = 0.5, 4.0
-# Error of a shift that interpolation, lens and light leave with any contrast [px].
-_FLOOR_PX = 0.02
-# Step after which a patch is at rest [px]; the next would be a small part of it.
-_SETTLED_PX = 1e-3
-# Residual of a patch that follows the camera: in pixels of its scale, and in sigmas.
-_GATE_PX, _GATE_SIGMA = 1.0, 4.0
-# Fewest patches that follow the camera, and their share of all in the reference: where parts cover
-# three tenths of both images, their edges are many of the best patches.
-_FEWEST, _SHARE = 12, 0.15
-# Share of patches at rest by which two motions are as likely as one.
-_RIVAL = 0.5
+# Half the side of a patch [px], and blocks along its side whose patches share errors.
+_HALF, _BLOCKS = 8, 5
+# Residual of a patch that follows the camera, in pixels of its scale.
+_GATE_PX = 1.0
+# Fewest patches that follow the camera.
+_FEWEST = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +98,10 @@ def _sharpness(image: Image) -> float:
 
 def _pyramid(image: Image) -> list[FloatArray]:
     """Smoothed copies, the finest first; pixel (u, v) of one is (u / 2, v / 2) of the next."""
-    levels = [np.asarray(cv2.GaussianBlur(image.astype(float), (0, 0), _SMOOTH_PX), float)]
-    while min(levels[-1].shape) >= 2 * _COARSEST_PX:
+    # Smoothing before anything else, against aliasing [px].
+    levels = [np.asarray(cv2.GaussianBlur(image.astype(float), (0, 0), 1.0), float)]
+    # The coarsest image is 120 wide, or more [px].
+    while min(levels[-1].shape) >= 240:
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), float))
     return levels
 
@@ -170,7 +158,9 @@ def _registered(
         return nothing(size, f"the reference has too little texture: {words}")
     count = int(rows.any(axis=(1, 2)).sum())
     of_pose = _covariance(at[found] / camera.resolution, rows, rest)
-    if count < max(_FEWEST, _SHARE * len(at)) or not np.isfinite(of_pose).all():
+    # Least share of the reference's patches that follow the camera: where parts cover three tenths
+    # of both images, their edges are many of the best patches.
+    if count < max(_FEWEST, 0.15 * len(at)) or not np.isfinite(of_pose).all():
         words = f"{count} of {len(at)} patches of the reference are found and agree"
         return nothing(size, f"another scene, or much of it moved: {words}")
     # A part on the camera, or a belt that carries most of the texture, moves against the rest.
@@ -178,7 +168,8 @@ def _registered(
     if away.any():
         shifts, _, found = _tracked(before[0], now[0], at, np.zeros_like(at))
         still = (found & away & (np.linalg.norm(shifts, axis=1) < _GATE_PX)).sum()
-        if still > _RIVAL * count:
+        # Share of patches at rest by which two motions are as likely as one.
+        if still > 0.5 * count:
             words = f"{still} patches stand still while {count} move together"
             return nothing(size, f"something large moves, or hangs on the camera: {words}")
     px, by_motion = _seen(camera, middle, pose)
@@ -194,14 +185,16 @@ def _textured(image: FloatArray, mask: Mask, scale: int) -> FloatArray:
     box = 2 * _HALF + 1
     reach = np.ones((scale * box, scale * box), np.uint8)
     inside = cv2.erode(mask.astype(np.uint8), reach, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    apart = max(_HALF, float(np.sqrt(image.size / _PATCHES)))
+    # Most patches of an image, about.
+    apart = max(_HALF, float(np.sqrt(image.size / 600)))
     found: tuple[Any, ...] = cv2.goodFeaturesToTrackWithQuality(
         image.astype(np.float32), 0, 1e-6, apart, inside[::scale, ::scale].copy(), blockSize=box
     )
     if found[0] is None:
         return np.zeros((0, 2))
     # The smaller eigenvalue of a shift's information, with slopes that OpenCV divides by box / 2.
-    return np.asarray(found[0].reshape(-1, 2)[found[1].ravel() * (box / 2) ** 2 > _TEXTURE], float)
+    # Least information of a patch on its shift [grey^2/px^2]: 0.3 px in noise of 2 grey levels.
+    return np.asarray(found[0].reshape(-1, 2)[found[1].ravel() * (box / 2) ** 2 > 44.0], float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,15 +250,19 @@ def _tracked(
         length[moving] = away = np.linalg.norm(rest, axis=1)
         # Beyond a pixel and a half the slopes say only where it goes.
         shifts[moving] -= rest * np.minimum(1.0, 1.5 / np.maximum(away, 1e-9))[:, None]
-        moving = moving[away > _SETTLED_PX]
+        # Step after which a patch is at rest [px]; the next would be a small part of it.
+        moving = moving[away > 1e-3]
     variance = np.mean((values - (columns @ solved[:, :, None])[:, :, 0]) ** 2, axis=1)
     covariances = variance[:, None, None] * inverse[:, 2:, 2:] / gain[:, None, None] ** 2
     limit = np.array(before.shape[::-1]) - _HALF - 1
     found = np.all((at + shifts > _HALF) & (at + shifts < limit), axis=1) & np.isfinite(gain)
-    found &= (length < 0.1) & (variance < (1 - _ALIKE) * values.var(axis=1))
-    # More is left where something else is in a part of the patch.
-    found &= variance < _MOST_VARIANCE * np.median(variance[found]) if found.any() else found
-    return shifts, covariances + _FLOOR_PX**2 * np.eye(2), found
+    # Share of a patch's variance then that is found now.
+    found &= (length < 0.1) & (variance < 0.5 * values.var(axis=1))
+    # More is left where something else is in a part of the patch. Residual variance of a patch over
+    # the median.
+    found &= variance < 4.0 * np.median(variance[found]) if found.any() else found
+    # Error of a shift that interpolation, lens and light leave with any contrast [px].
+    return shifts, covariances + 0.02**2 * np.eye(2), found
 
 
 def _fitted(
@@ -299,7 +296,8 @@ def _fitted(
         length = np.linalg.norm(rest, axis=1)
         # Half of the lengths of a plane's standard normal vectors are below 1.177.
         sigma = max(float(np.median(length[followed])) / 1.177, 0.3)
-        followed = (length < _GATE_SIGMA * sigma) & (np.linalg.norm(off, axis=1) < gate)
+        # Residual of a patch that follows the camera, in sigmas.
+        followed = (length < 4.0 * sigma) & (np.linalg.norm(off, axis=1) < gate)
         step = np.linalg.pinv(rows[followed].reshape(-1, size)) @ rest[followed].ravel()
         pose = _moved(pose, step)
     return pose, rows * followed[:, None, None], (rest - rows @ step) * followed[:, None]

@@ -31,9 +31,8 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
-# Random orders of the rows, by which a reading closes the chain by chance; a score from which on it
-# explains nothing, as of a board that looks the same after half a turn.
-_SHUFFLES, _MOST_SCORE = 8, 0.3
+# Random orders of the rows, by which a reading closes the chain by chance.
+_SHUFFLES = 8
 # Log prior odds by the logarithm of the ratio of the edges' lengths, and their bound.
 _BY_LENGTH = 10.0
 # How the sentence begins where the motion leaves the reading open.
@@ -43,8 +42,6 @@ NO_READING = "No reading that was tried stands out"
 POSE_OPTIONS = "--robot-form, --robot-unit, --robot-inverse, or --robot-columns in the right order"
 # Poses of two readings that differ by less than this share of the residuals are the same.
 _SAME = 0.3
-# Turns of two readings that differ by less, as a share, are alike.
-_ALIKE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +150,10 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
     declared, *others = tried
     best = others[0] if others else declared
     beaten = best.log_posterior - CLEAR
+    # From this score on it explains nothing, as of a board that looks the same after half a turn.
     if (
         beaten <= declared.log_posterior
-        or best.fit.score > _MOST_SCORE
+        or best.fit.score > 0.3
         or not _brings_nearer(best, declared)
         or _turns_about_one_axis(best)
         or any(other.log_posterior > beaten and not _are_same(best, other) for other in others)
@@ -168,7 +166,8 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
 
 def _brings_nearer(item: Candidate, declared: Candidate) -> bool:
     """Whether places agree clearly better, where turns are the same: units alone shrink figures."""
-    if declared.fit.closes or not np.isclose(item.fit.rms[1], declared.fit.rms[1], rtol=_ALIKE):
+    # Turns of two readings that differ by less, as a share, are alike.
+    if declared.fit.closes or not np.isclose(item.fit.rms[1], declared.fit.rms[1], rtol=0.1):
         return True
     return CLEAR_RATIO * item.misfit < declared.misfit
 

@@ -37,13 +37,6 @@ STARTS = 12
 # rows apart beside another mistake, which the second is for; fewer would agree with any reading.
 KEPT_SHARE, HALF_SHARE = 0.7, 0.45
 _SUBSET = 4
-# Places of a point read at so few stops determine where it and the instrument are; steps towards
-# their least squares.
-_PLACES_SUBSET, _STEPS = 6, 4
-# Starts that are followed.
-_FOLLOWED = 3
-# Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
-_SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # Standard deviation by axis [rad, or share of the distance], at least and at most: readings are not
 # distinguished by less than the first.
 _LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
@@ -51,8 +44,6 @@ _LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
 _OUTLIER_PRIOR = 0.05
 # Rounds in which the nearest rows are found.
 CONCENTRATED = 4
-# Directions with a smaller singular value, relative to the largest, are not determined.
-_DETERMINED = 1e-3
 # Another program's lens shifts a camera by some hundredths of its distance [m], and turns it less
 # than so: no camera is so near a flange, its axes parallel, and a board so flat in a base at once.
 _SAME_M, _PARALLEL = 0.02, np.cos(np.radians(2.0))
@@ -196,7 +187,9 @@ def is_about_one_axis(rotations: FloatArray) -> bool:
     # Turning about one axis leaves directions along it fixed: the last singular value vanishes.
     singular = np.linalg.svd((rotations - rotations.mean(axis=0)).reshape(-1, 3), compute_uv=False)
     singular /= np.sqrt(len(rotations))
-    return bool(singular[2] < max(_SECOND_AXIS * singular[0], _LEAST_TURN_RAD))
+    # Smaller turns about a second axis, relative to the largest or absolute, are noise of the
+    # poses.
+    return bool(singular[2] < max(0.05 * singular[0], 0.01))
 
 
 def robust_fits(
@@ -272,7 +265,8 @@ def _least_trimmed(
         edges, sums = np.hstack([edges, more[0]]), np.hstack([sums, more[1]])
         nearest = np.hstack([nearest, more[2]])
     if sets:
-        followed = every[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
+        # Starts that are followed.
+        followed = every[:, None], np.argsort(sums, axis=1)[:, :3]
         edges, sums, nearest = edges[followed], sums[followed], nearest[followed]
     falls = np.ones(sums.shape, dtype=bool)
     for _ in range(6 if sets else 2):
@@ -315,7 +309,8 @@ def mounting_fits(
         squares = (_missed(each, read, edges) / lever) ** 2
         return edges, *_trimmed(squares, kept)
 
-    sets = _random_sets(count, starts, _PLACES_SUBSET)
+    # Places of a point read at so few stops determine where it and the instrument are.
+    sets = _random_sets(count, starts, 6)
     if 0 < window < count:
         firsts = np.arange(0, count - window + 1, window // 2)
         sets.append(firsts[:, None] + np.arange(window))
@@ -336,7 +331,8 @@ def _mounted(flanges: FloatArray, read: FloatArray) -> FloatArray:
     linear = _least_squares(design, places.reshape(*flat, 1))[..., :9]
     rotation = nearest_rotation(linear.reshape(*linear.shape[:-1], 3, 3))
     values = np.zeros((*linear.shape[:-1], 9))
-    for _ in range(_STEPS):
+    # Steps towards their least squares.
+    for _ in range(4):
         pointed = read @ np.swapaxes(rotation, -1, -2)
         design = np.concatenate([-skew(pointed), eye, -turned], axis=-1).reshape(*flat, 9)
         values = _least_squares(design, (places - pointed).reshape(*flat, 1))
@@ -423,7 +419,8 @@ def distance_factor(robot: FloatArray, camera: FloatArray, fit: Fit) -> tuple[fl
     kept, inverse = np.argsort(fit.angle, kind="stable")[: len(fit.kept)], 0.0
     for _ in range(CONCENTRATED):
         rows, some = by_edges[kept].reshape(-1, 7), seen[kept].reshape(-1)
-        solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=_DETERMINED)
+        # Directions with a smaller singular value, relative to the largest, are not determined.
+        solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=1e-3)
         if rank < 7:
             return None
         away = np.linalg.norm(seen + by_edges @ solution, axis=1)

@@ -37,12 +37,6 @@ _MODEL_DEVIATION = 0.03
 # leave more, unless they change nothing. Scores below the second are alike: controllers print their
 # poses no more finely.
 _FITS, _FLOOR = 2e-3, 1e-4
-# Ratio to the best score within which readings are equivalent: those with the fewest mistakes are
-# chosen.
-_EQUIVALENT = 2.0
-# First step of a joint's zero. A shift of 180 degrees is left out: it looks like an opposite sign
-# of the joint before or behind it.
-_STEP_RAD = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +223,9 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
         readings = [*joint_readings(robot), *_with_zeros(robot, q, poses, rows)]
         tried = _fitted(readings, q, poses, rows, STARTS)
     least = min(item.score for item in tried)
-    equivalent = [item for item in tried if item.score <= _EQUIVALENT * least]
+    # Ratio to the best score within which readings are equivalent: those with the fewest mistakes
+    # are chosen.
+    equivalent = [item for item in tried if item.score <= 2.0 * least]
     equivalent.sort(key=lambda item: (item.reading.cost, item.score))
     if least > _MODEL_DEVIATION or declared.score <= CLEAR_RATIO * equivalent[0].score:
         return JointGuess(declared, declared)
@@ -247,7 +243,9 @@ def _with_zeros(
     robot: Robot, q: FloatArray, poses: FloatArray, rows: IntArray
 ) -> list[JointReading]:
     """The best zero of each inner joint; those of the first and last hide in the constants."""
-    step = _STEP_RAD
+    # First step of a joint's zero. A shift of 180 degrees is left out: it looks like an opposite
+    # sign of the joint before or behind it.
+    step = 0.25
     grid = np.arange(step - np.pi, np.pi - 0.5 * step, step)
     zeros = dict.fromkeys((np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist(), 0.0)
     best: list[FittedJoints] = []

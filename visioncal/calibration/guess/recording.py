@@ -24,17 +24,12 @@ from visioncal.core.types import FloatArray, IntArray, Mount
 
 # With fewer views too many readings agree; more than the second add time and no certainty.
 FEWEST_ROWS, _FITTED_ROWS = 4, 30
-# Share of the rows at either end in which a reading may be right alone: beside rows that are apart
-# from fewer than these on, most of the others agree in another order.
-_END_SHARE = 0.4
 # Share of the log-likelihood that counts: the errors of an arm, a lens and a board are common to
 # the views, which count as half as many independent ones.
 EVIDENCE = 0.5
 # Log odds by which one reading is preferred to another, against each change of the declared one,
 # and against a cell that cannot be.
 CLEAR, _CHANGE, IMPOSSIBLE = 3.0, 4.0, 20.0
-# Plausible distances between camera and board [m].
-_BOARD_DISTANCE_M = (0.02, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +71,9 @@ class Recording:
     def ends(self) -> "Iterator[Recording]":
         """The recording's first and its last rows, where these suffice to compare readings."""
         rows = self.common_rows
-        count = int(np.ceil(_END_SHARE * len(rows)))
+        # Share of the rows at either end in which a reading may be right alone: beside rows that
+        # are apart from fewer than these on, most of the others agree in another order.
+        count = int(np.ceil(0.4 * len(rows)))
         if count < FEWEST_STOPS:
             return
         for some in (slice(0, rows[count - 1] + 1), slice(rows[-count], len(self.robot))):
@@ -87,7 +84,8 @@ class Recording:
 
     def is_likely(self, tried: Hypothesis) -> bool:
         """Whether the unit of the camera's positions puts the target at a likely distance."""
-        low, high = _BOARD_DISTANCE_M
+        # Plausible distances between camera and board [m].
+        low, high = (0.02, 30.0)
         unit_m = tried.camera.scale * UNITS_M[tried.camera.unit]
         return bool(low < unit_m * self._distance < high)
 

@@ -47,16 +47,15 @@ from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.closed_form import upper_pairs
 
-# Turns of robot and camera agree from here on [rad]. A print differs by less than the first
-# logarithm from its stated size; a fit follows the second.
-_TURNS_AGREE_RAD, _PRINTED, _FOLLOWED = 0.1, 0.03, 0.2
+# Turns of robot and camera agree from here on [rad].
+_TURNS_AGREE_RAD = 0.1
 # Fields of a reading by which its turns from view to view change.
 _TURNING = frozenset(("rotation", "written", "terms", "angle_unit", "order"))
 # Form of rotations, that of which they were written, terms and unit of angles of a reading.
 _Rotations: TypeAlias = tuple[str, str, tuple[int, ...], float]
-# The screening and the first fits hand on at most so many readings, whose scores are near the best
-# one's but for a quarter of a degree, which noisy poses of few views add to any bound.
-_HANDED_ON, _SLACK = 400, 5e-3
+# Readings that are handed on have scores near the best one's but for a quarter of a degree, which
+# noisy poses of few views add to any bound.
+_SLACK = 5e-3
 # Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
 PAIRS_SHARE = 0.35
 
@@ -232,7 +231,9 @@ def _of_another_size(
         if found_factor is None:
             continue
         scale, _ = found_factor
-        if abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
+        # A print differs by less than the first logarithm from its stated size; a fit follows the
+        # second.
+        if abs(np.log(scale)) < (0.03 if changed else 0.2):
             continue
         subject = (
             "the board" if recording.is_measured else "the camera's distances, and so the board,"
@@ -305,7 +306,8 @@ def _near(tried: Sequence[Hypothesis], scores: Sequence[float]) -> list[Hypothes
         for at, (reading, score) in enumerate(zip(tried, scores, strict=True))
         if score <= limit
     ]
-    return [tried[at] for _, at in sorted(near)[:_HANDED_ON]]
+    # The screening and the first fits hand on at most so many readings.
+    return [tried[at] for _, at in sorted(near)[:400]]
 
 
 def _mismatch(

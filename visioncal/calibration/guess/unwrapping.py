@@ -20,8 +20,8 @@ _TURN = 2.0 * np.pi
 # Rotations by angles 57 times as large are alike to half a radian, by chance in one view of 150. So
 # many views decide, but for a few that may be wrong, as may be the first.
 _ALIKE, _CHECKED, _WRONG = float(np.cos(0.5)), 8, 2
-# Views whose rivals are all tried together: five determine the places. Their random choices.
-_PLACING, _PLACINGS = 6, 12
+# Views whose rivals are all tried together: five determine the places.
+_PLACING = 6
 
 
 def _forms(*, keep_turns: bool) -> Iterator[tuple[str, str]]:
@@ -99,7 +99,8 @@ def in_one_place(positions: FloatArray, camera: FloatArray, mount: Mount) -> Int
     # A turn of the target that is the same in all views stays open.
     choices = np.array([(0, *rest) for rest in product(range(rivals), repeat=_PLACING - 1)])
     rng, least, best = np.random.default_rng(0), np.inf, None
-    for _ in range(_PLACINGS):
+    # Random choices of the views.
+    for _ in range(12):
         some = rng.choice(count, _PLACING, replace=False)
         sides = rows[some, choices].reshape(-1, 3 * _PLACING, 15), seen[some, choices, :3, 3]
         square = np.swapaxes(sides[0], 1, 2) @ sides[0]

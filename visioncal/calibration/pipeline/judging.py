@@ -78,10 +78,6 @@ def judged_beside(state: RunState, found: Sequence[Finding]) -> RunState:
     return _judged(state, findings, judge(findings))
 
 
-# Share of a variance that is left without a source to which most of it is due.
-_LEAVES = 0.3
-
-
 def findings_of(run: RunState) -> Findings:
     """Collects the input of the verdict."""
     answer = run.assessment
@@ -115,7 +111,8 @@ def _is_by_lens(run: RunState, worst: Sequence[Direction]) -> bool:
     known = fit.whole - fit.whole[:, lens] @ np.linalg.pinv(inner, hermitian=True) @ fit.whole[lens]
     given_lens = [found for _, found in directions(fit.problem, fit.state, known, names)]
     at = max(range(len(worst)), key=lambda at: worst[at].sigma / worst[at].limit)
-    return bool(given_lens[at].sigma ** 2 < _LEAVES * worst[at].sigma ** 2)
+    # Share of a variance that is left without a source to which most of it is due.
+    return bool(given_lens[at].sigma ** 2 < 0.3 * worst[at].sigma ** 2)
 
 
 def _use(run: RunState) -> Remedy:

@@ -9,9 +9,6 @@ from visioncal.results.lens import LensField
 from visioncal.vision.corners import floored_sigma_px
 from visioncal.vision.lens_field import LensLevels, depths_m, displacements
 
-# Variance of displacements that is negligible beside that of corners; grid points per image axis.
-_NEGLIGIBLE, _GRID = 1e-4, 12
-
 
 def mean_distance_m(fit: Fit, camera: str) -> float:
     """The mean distance of one camera's views [m]."""
@@ -64,10 +61,12 @@ def lens_field_of(fit: Fit, camera: str) -> LensField | None:
 
 def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatArray:
     """(m, r) root of a covariance of coefficients, without those of negligible displacement."""
-    x_px, y_px = (np.linspace(0.0, size - 1.0, _GRID) for size in camera.resolution)
+    # Grid points per image axis.
+    x_px, y_px = (np.linspace(0.0, size - 1.0, 12) for size in camera.resolution)
     px = np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2)
     # Breathing counts at twice the mean distance.
     size = np.sqrt(np.mean(np.sum(displacements(px, camera, 1.0, levels) ** 2, axis=1), axis=0))
     values, vectors = np.linalg.eigh(np.outer(size, size) * covariance)
-    kept = values > _NEGLIGIBLE
+    # Less variance of displacements is negligible beside that of corners.
+    kept = values > 1e-4
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) / size[:, None])

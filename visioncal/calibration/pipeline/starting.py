@@ -29,8 +29,6 @@ from visioncal.vision.pnp import ViewPoses
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
 # Share of the rows that agree, below which something may have moved.
 _MOST_AGREE = 0.9
-# Share from which a board is of another size: some sigma of a print that is as stated.
-_OTHER_SIZE = 5e-3
 _AMBIGUOUS = "ambiguous: two poses of the target fit image and motion alike"
 
 
@@ -120,7 +118,8 @@ def _is_start(solved: CellFit, cell: Cell) -> bool:
     the poses of no half of the rows agree otherwise.
     """
     is_pair, opened = cell.mount is not None, solved.fit.unknowns.opened
-    is_sized = any(abs(share) > _OTHER_SIZE for share in scales_of(solved).values())
+    # Share from which a board is of another size: some sigma of a print that is as stated.
+    is_sized = any(abs(share) > 5e-3 for share in scales_of(solved).values())
     is_still = not any(effect.place == "edge" for effect in opened)
     return bool(np.mean(solved.used) >= _MOST_AGREE) and (is_pair or (is_sized and is_still))
 

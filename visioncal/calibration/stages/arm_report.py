@@ -41,9 +41,6 @@ from visioncal.robot.workspace import postures
 
 # Number of postures of a map of the accuracy.
 _PLACES = 200
-# Zeros and eccentricities that are off by more than makers leave [rad], in so many sigmas: what the
-# names of their parameters contain, and words.
-_FAR_RAD, _CLEAR = 2e-3, 10.0
 _FAR_OFF = (
     ("theta", "Zeros are off", "where they were lost, or the model counts from others"),
     ("sine", "Encoders or gears run out", "where they sit eccentrically"),
@@ -95,8 +92,10 @@ def far_off(parameters: Sequence[ArmParameter], robot: Robot) -> Iterator[str]:
     for name, words, why in _FAR_OFF:
         off = dict[str, float]()
         for at in parameters:
-            # A cosine's name contains that of a sine.
-            if name in at.name and at.sigma and abs(at.change) > max(_FAR_RAD, _CLEAR * at.sigma):
+            # A cosine's name contains that of a sine. Zeros and eccentricities that are off by more
+            # than makers leave [rad], in so many sigmas: what the names of their parameters
+            # contain, and words.
+            if name in at.name and at.sigma and abs(at.change) > max(2e-3, 10.0 * at.sigma):
                 off[at.joint] = float(np.hypot(off.get(at.joint, 0.0), at.change))
         places = map(robot.joint_names.index, off)
         sizes = [

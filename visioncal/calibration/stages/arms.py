@@ -36,11 +36,6 @@ from visioncal.robot.errors import ArmErrors, link_basis, pose_basis
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
 
-# Rounding of written poses and joints [m, rad].
-_ROUNDING = 1e-5
-# Fewest stops for functions of the joints.
-_FEWEST_FOR_FUNCTIONS = 20
-
 
 @dataclass(frozen=True, eq=False)
 class RobotArm:
@@ -191,8 +186,9 @@ class RobotArm:
         tools, inliers = invert(nominal) @ self.reported[self.has_pose], agrees[self.has_pose]
         residuals = distances(tools, mean_transform(tools[inliers]))
         matches = agrees.copy()
+        # Rounding of written poses and joints [m, rad].
         matches[self.has_pose] = np.all(
-            [array <= 2.0 * array[inliers].max() + _ROUNDING for array in residuals], axis=0
+            [array <= 2.0 * array[inliers].max() + 1e-5 for array in residuals], axis=0
         )
         return matches
 
@@ -286,7 +282,8 @@ class RobotArm:
         q, every = used.joints_rad, self.joints_rad
         if self.matched is None or q is None or every is None or not len(q):
             return self
-        if functions and (HARMONICS not in ASKED[level] or len(q) < _FEWEST_FOR_FUNCTIONS):
+        # Fewest stops for functions of the joints.
+        if functions and (HARMONICS not in ASKED[level] or len(q) < 20):
             return self
         found_levels = []
         for robot in self._hypotheses(used.loads):

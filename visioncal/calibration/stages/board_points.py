@@ -33,28 +33,10 @@ from visioncal.vision.poses import fit_poses
 from visioncal.vision.targets import corner_positions, first_numbers
 
 T = TypeVar("T", bound=Observed)
-# Fewest views of which the scatter of a mean is known, and most that are needed.
-_FEWEST, _MOST_VIEWS = 8, 60
-# Fewest views in which a corner scatters: of fewer, poses and lens take so much of the others'
-# noise that one which they follow no more looks as if it had twice theirs.
-_FEWEST_STEADY = 12
-# Two unknowns a corner: larger boards are taken to be true.
-_MOST_POINTS = 150
-# Half waves of the image's field: a finer one would be that of single corners.
-_WAVES = 6.0
-# Views whose residuals are larger than the typical ones by this ratio are wrong.
-_WRONG = 5.0
-# Chance by which a sound board has a corner that scatters too much, and what does no harm [px].
-_UNSTEADY, _LEAST_PX = 1e-6, 0.1
-# Most rounds of the weights of corners, and the change below which they have converged: one of a
-# hundredth of their noise.
-_ROUNDS, _CONVERGED = 12, 0.01
+# Fewest views of which the scatter of a mean is known.
+_FEWEST = 8
 # Combinations of what is smooth that corners show by less than this share of the most are none.
 _SHOWN = 1e-5
-# Noise beside what moves in single views, over that without, above which nothing does.
-_MOVES = 0.9
-# Directions that poses, lens and shape do not leave open, by the information they leave.
-_OPEN = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +138,8 @@ def point_errors(
         return None
     rest = {view: at.take(~np.isin(at.ids, found.unsteady)) for view, at in corners.items()}
     moving = _point_errors(target, camera, rest, cam_from_target, is_moving=True)
-    if moving is None or moving.noise_px > _MOVES * found.noise_px:
+    # Noise beside what moves in single views, over that without, above which nothing does.
+    if moving is None or moving.noise_px > 0.9 * found.noise_px:
         return found
     # Focus, a rolling shutter or a wrong lens: these move the outer corners of a board most.
     moving = _point_errors(target, camera, corners, cam_from_target, is_moving=True)
@@ -174,14 +157,17 @@ def _point_errors(
     """`point_errors`; beside zoom and motion of the rows of each view where `is_moving`."""
     positions = corner_positions(target)
     chosen = [view for view in corners if len(corners[view].ids) * 2 > len(positions)]
-    chosen = [chosen[at] for at in evenly(len(chosen), _MOST_VIEWS).tolist()]
-    if len(chosen) < _FEWEST or len(positions) > _MOST_POINTS:
+    # Most views that are needed.
+    chosen = [chosen[at] for at in evenly(len(chosen), 60).tolist()]
+    # Two unknowns a corner: larger boards are taken to be true.
+    if len(chosen) < _FEWEST or len(positions) > 150:
         return None
     stack = CornerStack.of({view: corners[view] for view in chosen}, positions)
     stack = replace(stack, weights=None)
     poses = fit_poses(stack, camera, np.array([cam_from_target[v] for v in chosen]))
     squares = mean_square_by_view(stack, poses.residuals)
-    right = squares <= _WRONG**2 * np.median(squares)
+    # Views whose residuals are larger than the typical ones by this ratio are wrong.
+    right = squares <= 5.0**2 * np.median(squares)
     if right.sum() < _FEWEST:
         return None
     stack, starts = stack.keep(right[stack.view_of]), poses.cam_from_target[right]
@@ -193,14 +179,15 @@ def _point_errors(
     by_view = np.concatenate(each_view, axis=2)[:, :, : None if is_moving else 0]
     columns, smooth = _columns(stack, camera, at, basis, count)
     # Wrong corners hide each other, since poses and lens follow them: each counts by what it
-    # scatters beside the others.
-    for _ in range(_ROUNDS):
+    # scatters beside the others. Most rounds of the weights of corners.
+    for _ in range(12):
         stack = replace(stack, weights=weights[stack.ids], zooms=by_view)
         by_places, pulls, unknowns = _reduced(stack, columns, smooth)
         flat = by_places.reshape(-1, count)
         inner = flat.T @ flat
         values, vectors = np.linalg.eigh(inner)
-        is_open = values > _OPEN * np.median(values)
+        # Directions that poses, lens and shape do not leave open, by the information they leave.
+        is_open = values > 1e-4 * np.median(values)
         values, vectors = values[is_open], vectors[:, is_open]
         rows = by_places @ (vectors / np.sqrt(values))
         found = np.einsum("nai,na->i", rows, pulls)
@@ -209,10 +196,13 @@ def _point_errors(
         if ratios.max() < chi2_limit(0.1 / len(ratios), 2 * views) / (2 * views):
             break
         before, weights = weights, 1.0 / np.sqrt(np.maximum(ratios, 1.0))
-        if np.abs(weights - before).max() < _CONVERGED:
+        # Weights have converged at a hundredth of the noise of corners.
+        if np.abs(weights - before).max() < 0.01:
             break
-    limit = chi2_limit(_UNSTEADY / len(ratios), 2 * views) / (2 * views)
-    wrong = np.flatnonzero((ratios > limit) & (scatter > _LEAST_PX))
+    # Chance by which a sound board has a corner that scatters too much.
+    limit = chi2_limit(1e-6 / len(ratios), 2 * views) / (2 * views)
+    # Less does no harm [px].
+    wrong = np.flatnonzero((ratios > limit) & (scatter > 0.1))
     if len(wrong):
         rest = {view: at.take(~np.isin(at.ids, wrong)) for view, at in corners.items()}
         others = _point_errors(target, camera, rest, cam_from_target, is_moving=is_moving)
@@ -221,8 +211,10 @@ def _point_errors(
         unsteady = np.union1d(others.unsteady, wrong)
         most = max(others.unsteady_px, float(np.sqrt(np.mean(scatter[wrong] ** 2))))
         if len(unsteady) <= len(positions) / 3:
-            # Of few views they are not named, but say nothing of the board either.
-            named = views >= _FEWEST_STEADY
+            # Of few views they are not named, but say nothing of the board either. Fewest views in
+            # which a corner scatters: of fewer, poses and lens take so much of the others' noise
+            # that one which they follow no more looks as if it had twice theirs.
+            named = views >= 12
             unsteady, most = (unsteady, most) if named else (unsteady[:0], 0.0)
             return replace(others, unsteady=unsteady, unsteady_px=most)
     each = stack.sum_by_view(np.einsum("nai,na->ni", rows, left))
@@ -266,7 +258,8 @@ def _columns(
 ) -> tuple[FloatArray, int]:
     """Derivatives (n, 2, 6 + s + count) by poses, what is smooth and places, then residuals; s."""
     orders = orders_of_waves()
-    orders = orders[np.sum(orders**2, axis=1) <= _WAVES**2]
+    # Half waves of the image's field: a finer one would be that of single corners.
+    orders = orders[np.sum(orders**2, axis=1) <= 6.0**2]
     # Where corners are predicted: at those seen, the field could explain their noise.
     field = waves(at.px, float(camera.resolution[0]), orders)
     none = np.zeros_like(field)

@@ -37,9 +37,6 @@ from visioncal.vision.targets import first_numbers
 
 T = TypeVar("T", bound=Observed)
 
-# Stated intrinsics belong to another camera where estimated ones fit clearly better, and either
-# a focal length differs by more than any focusing [share] or the stated ones fit badly.
-_OTHER_FOCAL = 0.1
 # Shares by which matrices of one lens differ, for images of two sizes.
 _SAME_RATIO = 0.03
 NEW_LENS = mending(
@@ -47,11 +44,8 @@ NEW_LENS = mending(
     "and distortion)",
     Option("intrinsics", "estimate"),
 )
-# A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
-# the move where stated intrinsics were misread.
-_CROPPED_PX, _EXPLAINED = 10.0, 0.1
-# Travel during an exposure from which on it matters when the robot's pose was read [m].
-_TRAVEL_M = 2e-4
+# A part of a picture begins farther from its corner than any centre is wrong [px].
+_CROPPED_PX = 10.0
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
@@ -153,7 +147,8 @@ def _with_dense(
         "as these are blurred."
     )
     lost = [rejection for rejection in detections.rejections if rejection.view not in found]
-    moving = {view: at.motion_m for view, at in found.items() if at.motion_m > _TRAVEL_M}
+    # Travel during an exposure from which on it matters when the robot's pose was read [m].
+    moving = {view: at.motion_m for view, at in found.items() if at.motion_m > 2e-4}
     if moving:
         most_mm = figure(1e3 * max(moving.values()))
         note += f" The board moves by up to {most_mm} mm during an exposure"
@@ -353,7 +348,9 @@ def _other_lens(
         # The images do not determine a lens, or show another board than the stated one.
         return None
     change = np.abs(lens.camera.matrix[:2] / stated.matrix[:2] - 1.0)
-    is_other = change.max() > _OTHER_FOCAL or stated_px > CalibrationLimits().pixel_px[1]
+    # Stated intrinsics belong to another camera where estimated ones fit clearly better, and either
+    # a focal length differs by more than any focusing [share] or the stated ones fit badly.
+    is_other = change.max() > 0.1 or stated_px > CalibrationLimits().pixel_px[1]
     if not is_other or CLEAR_RATIO * lens.sigma_px > stated_px:
         return None
     poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
@@ -411,7 +408,8 @@ def misread_lens(stated: Camera, refined: Camera, px: FloatArray, moved_px: floa
         ways[words] = replace(stated, matrix=np.append(stated.matrix[:2], refined.matrix[2:]))
     left = {words: most_moved_px(lens, refined, px)[0] for words, lens in ways.items()}
     best = min(left, key=left.__getitem__, default="")
-    return f" {best}" if best and left[best] < _EXPLAINED * moved_px else ""
+    # So little of the move is left where stated intrinsics were misread.
+    return f" {best}" if best and left[best] < 0.1 * moved_px else ""
 
 
 def most_moved_px(stated: Camera, other: Camera, px: FloatArray) -> tuple[float, float]:

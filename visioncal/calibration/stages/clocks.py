@@ -66,8 +66,6 @@ T = TypeVar("T", bound=Observed)
 _SHOW_OFFSET = Remedy(
     "Take the views at rest, or record a sweep that turns fast enough to show the clocks' offset."
 )
-# Most rounds of lens and readout, and the change of the readout, over its sigma, that ends them.
-_ROUNDS, _SETTLED = 5, 0.3
 # Up to this number all views are used; of more, slow ones.
 _MANY_VIEWS = 60
 
@@ -98,7 +96,9 @@ def _beside_shutter(seen: T, pair: ClockPair, rows: list[View]) -> T:
     less of it to the shutter.
     """
     found, targets = _with_clock(seen, pair, rows), tuple(seen.session.boards.values())
-    for _ in range(_ROUNDS):
+    # Most rounds of lens and readout, and the change of the readout, over its sigma, that ends
+    # them.
+    for _ in range(5):
         look, clocked = seen.cameras.get(pair.camera), found.clocks.get(pair)
         shutter = None if clocked is None else clocked.clock.shutter
         is_open = look is not None and look.lens is not None and look.lens.estimated
@@ -121,7 +121,7 @@ def _beside_shutter(seen: T, pair: ClockPair, rows: list[View]) -> T:
         seen = locate_targets(seen.with_camera(pair.camera, replace(look, lens=lens)))
         found = _with_clock(seen, pair, rows)
         now = found.clocks[pair].clock.shutter if pair in found.clocks else None
-        if now is None or abs(now.readout_s - shutter.readout_s) < _SETTLED * now.readout_sigma_s:
+        if now is None or abs(now.readout_s - shutter.readout_s) < 0.3 * now.readout_sigma_s:
             break
     return found
 

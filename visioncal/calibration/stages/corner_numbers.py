@@ -28,13 +28,8 @@ EXCHANGE_COLUMNS = Remedy(
     "calibrate it.",
     MEND_IMAGES,
 )
-# Largest homography residual as a share of the corners' spread.
-_MOST_LEFT = 0.3
-# Such a share of a board with the right counts, and columns and rows that are tried.
-_LIKE, _MOST_COUNT = 0.05, 41
-# Distance outside the image that neither noise nor the half pixel of another origin explains [px],
-# and the least share of a view's corners so far out.
-_WELL_OUTSIDE_PX, _LEAST_OUTSIDE = 5.0, 0.05
+# Largest homography residual with the right counts, as a share of the corners' spread.
+_LIKE = 0.05
 
 
 def usable_corners(
@@ -105,8 +100,10 @@ def are_exchanged(
     px = np.concatenate([np.zeros((0, 2)), *(at.px for at, _ in views)])
     if (px[:, ::-1] > size).any() or not are_from_behind(views):
         return False
-    outside = [(at.px > size + _WELL_OUTSIDE_PX).any(axis=1).mean() for at, _ in views]
-    if np.median(outside) > _LEAST_OUTSIDE:
+    # Distance outside the image that neither noise nor the half pixel of another origin explains
+    # [px], and the least share of a view's corners so far out.
+    outside = [(at.px > size + 5.0).any(axis=1).mean() for at, _ in views]
+    if np.median(outside) > 0.05:
         # Width and height that are exchanged themselves are an upright picture's, and look alike.
         return bool(size[0] > size[1])
     if centre_px is None:
@@ -135,7 +132,8 @@ def _misnumbered(session: Session, name: str, views: Sequence[Corners]) -> list[
     points = corner_positions(target)
     if np.ptp(points[:, 2]) > 0.0 or not views:
         return []
-    wrong = [at.view for at in views if _residual(points[at.ids, :2], at.px) > _MOST_LEFT]
+    # Largest homography residual as a share of the corners' spread.
+    wrong = [at.view for at in views if _residual(points[at.ids, :2], at.px) > 0.3]
     is_other = 2 * len(wrong) > len(views)
     if figures := _counts(target, views) if is_other else otherwise(target, views):
         named = " and ".join(tomli_w.dumps(figures).splitlines())
@@ -173,7 +171,8 @@ def _counts(target: Target, views: Sequence[Corners]) -> dict[str, object]:
     if target.is_rig or not target.columns:
         return {}
     largest, some = max(int(at.ids.max()) for at in views), views[:: len(views) // 3 + 1]
-    for columns, rows in product(range(2, _MOST_COUNT), repeat=2):
+    # Columns and rows that are tried.
+    for columns, rows in product(range(2, 41), repeat=2):
         other = replace(target, columns=columns, rows=rows)
         points = corner_positions(other)[:, :2]
         enough = largest < len(points) <= largest + len(points) // rows

@@ -21,18 +21,10 @@ from visioncal.vision.targets import numbered_positions
 
 # Sizes of pictures, previews and scaled copies, as shares of the camera's.
 _SHARES = (1 / 5, 1 / 4, 1 / 3, 2 / 5, 1 / 2, 3 / 5, 2 / 3, 3 / 4, 4 / 5)
-# Difference of squared errors over the noise from which on a size is clearly another one: 6 sigma.
-_CLEAR_CHI2 = 36.0
 # Views of one lens and one board scatter by less than so many times those that fit best.
 _UNEVEN = 2.0
-# Ratio of misfits from which on a single view is clearly of another size.
-_CLEAR_ALONE = 5.0
 # Views by whose lens a share is tried before all are fitted, which takes as much longer.
 _FIRST_VIEWS = 8
-# Most error of a share, 3 sigma of it: usual sizes beside the listed ones (5/8) are 4 % off.
-_MOST_OFF = 0.015
-# Most distance of a lens's centre from the middle of its picture, as a share of half the picture.
-_OFF_CENTRE = 0.05
 # Step by which a share's cost is differentiated.
 _STEP = 0.005
 
@@ -129,9 +121,12 @@ def _scaled_by(
     is_known = np.isfinite(given) & np.isfinite(scaled)
     excess = np.subtract(given**2, picture_px**2, out=np.zeros(len(given)), where=is_known)
     fits = is_known & (picture_px < _UNEVEN * sigma_px) & (given > _UNEVEN * scaled)
-    fits &= 2.0 * counts * excess > _CLEAR_CHI2 * sigma_px**2
-    # Clear views determine the share, by which less clear ones are of it, too.
-    clear = fits & (given > (CLEAR_RATIO if fits.sum() > 1 else _CLEAR_ALONE) * scaled)
+    # Difference of squared errors over the noise from which on a size is clearly another one: 6
+    # sigma.
+    fits &= 2.0 * counts * excess > 36.0 * sigma_px**2
+    # Clear views determine the share, by which less clear ones are of it, too. Ratio of misfits
+    # from which on a single view is clearly of another size.
+    clear = fits & (given > (CLEAR_RATIO if fits.sum() > 1 else 5.0) * scaled)
     numbers = np.array([*corners])
     chosen = {view: corners[view] for view in numbers[clear].tolist()}
     if not chosen or not _is_share(known, chosen, targets, share):
@@ -170,7 +165,8 @@ def _is_share(
     of_corners = _STEP * sigma_px * np.sqrt(2.0 / curvature)
     of_lens = np.sqrt(np.diag(known.covariance)[:4]) / known.camera.matrix
     most = 3.0 * float(np.hypot(of_corners, of_lens.max()))
-    return bool(abs(off) < most < _MOST_OFF)
+    # Most error of a share, 3 sigma of it: usual sizes beside the listed ones (5/8) are 4 % off.
+    return bool(abs(off) < most < 0.015)
 
 
 def smaller_picture(lens: Camera, px: FloatArray) -> tuple[int, int] | None:
@@ -183,7 +179,9 @@ def smaller_picture(lens: Camera, px: FloatArray) -> tuple[int, int] | None:
     shares = 2.0 * (lens.matrix[2:4] + 0.5) / size
     share = min(_SHARES, key=lambda each: float(np.abs(shares - each).max()))
     width, height = np.round(share * size).astype(int).tolist()
-    is_near = bool(np.all(np.abs(shares - share) < _OFF_CENTRE * share))
+    # Most distance of a lens's centre from the middle of its picture, as a share of half the
+    # picture.
+    is_near = bool(np.all(np.abs(shares - share) < 0.05 * share))
     return (width, height) if is_near and (px < [width, height]).all() else None
 
 

@@ -24,15 +24,13 @@ from visioncal.vision.corners import CornerStack, WithoutPoses, floored_sigma_px
 from visioncal.vision.lens_field import depths_m, zooms
 from visioncal.vision.targets import corner_positions
 
-# Cells along the board's longer side in the image, and the fewest pixels of one.
-_CELLS, _LEAST = 12, 12
+# Fewest pixels of a cell.
+_LEAST = 12
 # Fewest cells of a view.
 FEWEST_CELLS = 6
-# Pixels of a view that are looked at: more make the median of a cell no better than its view.
-_PIXELS = 60_000
 # Deviation from the median, in its robust standard deviations, from which a cell is of something
-# else, and the greatest curvature of depth over a board, as a share of its distance.
-GATE, _BENT = 4.0, 0.008
+# else.
+GATE = 4.0
 # Of a pose's right perturbation, what moves its plane: turns about x and y, and z.
 _OF_PLANE = [0, 1, 5]
 
@@ -143,14 +141,17 @@ class Sensor:
         hull = np.rint(cv2.convexHull(corners.astype(np.float32))).astype(int)
         mask = cv2.fillConvexPoly(np.zeros(size[::-1], np.uint8), hull, 1)
         mask = cv2.erode(mask, np.ones((7, 7)))
-        step = int(np.ceil(np.sqrt(max(int(mask.sum()), 1) / _PIXELS)))
+        # Pixels of a view that are looked at: more make the median of a cell no better than its
+        # view.
+        step = int(np.ceil(np.sqrt(max(int(mask.sum()), 1) / 60_000)))
         rows, columns = (step * axis for axis in np.nonzero(mask[::step, ::step]))
         px = np.column_stack([columns, rows]).astype(float)
         rays = self.rays(px)
         true = distances(pose, rays)[0]
         excess = depth[rows, columns] - true * self.lengths(rays)
         shades = self._shades(view, apply(cam_from_depth, true[:, None] * rays))
-        side = max(float(np.ptp(corners, axis=0).max()) / _CELLS, 6.0)
+        # Cells along the board's longer side in the image.
+        side = max(float(np.ptp(corners, axis=0).max()) / 12, 6.0)
         key = px // side @ [1e4, 1.0]
         order, found = np.argsort(key, kind="stable"), []
         for cell in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
@@ -238,7 +239,8 @@ def on_board(cells: Cells, size: tuple[int, int]) -> Mask:
     Most of the board is seen: the densest band of deviations is its own. Within the band, cells
     are of something else that do not lie in one plane with the others.
     """
-    excess, band = cells.excess_m, _BENT * float(np.median(cells.true_m))
+    # Greatest curvature of depth over a board, as a share of its distance.
+    excess, band = cells.excess_m, 0.008 * float(np.median(cells.true_m))
     counts = np.sum(np.abs(excess[:, None] - excess) < band, axis=0)
     kept = np.abs(excess - excess[np.argmax(counts)]) < band
     kept &= cells.noise_m < 3.0 * np.median(cells.noise_m[kept]) + 1e-4

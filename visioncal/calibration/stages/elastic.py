@@ -68,11 +68,8 @@ def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult |
     )
 
 
-# Prior of a joint's bend by a load beyond that as stated: a gear of 10 kN m/rad [rad/(N m)]; and
-# rounds of a fit in factor and compliances, which are near.
-_SOFT, _ROUNDS = 1e-4, 20
-# Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
-_PLAY_RAD = 1e-3
+# Prior of a joint's bend by a load beyond that as stated: a gear of 10 kN m/rad [rad/(N m)].
+_SOFT = 1e-4
 # Loads from which on gears are tried for two slopes [N], torques among which their knees are, as
 # quantiles, and the least square of a second slope's change over its variance: chance leaves 10 in
 # one of a hundred arms, whose six joints each have seven knees.
@@ -178,7 +175,8 @@ def _payload_factor(arm: ArmData) -> Factor | None:
     information = np.linalg.inv(np.outer(units, units) * covariance[np.ix_(columns, columns)])
     compliance, by_load = np.split(found, 2)
     values = np.append(compliance, compliance @ by_load / (compliance @ compliance))
-    for _ in range(_ROUNDS):
+    # Rounds in factor and compliances, which are near.
+    for _ in range(20):
         compliance, over = values[:-1], values[-1]
         predicted = np.append(compliance, over * compliance)
         jacobian = np.eye(2 * count, count + 1)
@@ -280,8 +278,9 @@ def play_findings(plays: Sequence[JointBacklash]) -> Iterator[Finding]:
         for play in sure
     )
     largest_rad = max(abs(play.deadband_rad) for play in sure)
+    # Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
     yield Finding(
-        "joint_play" if largest_rad > _PLAY_RAD else NOTE,
+        "joint_play" if largest_rad > 1e-3 else NOTE,
         f"Joints have play: {words}. The calibrated arm stands in the middle of it; of the first "
         "stop, no motion shows the side.",
         Remedy(

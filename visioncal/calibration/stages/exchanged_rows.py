@@ -15,9 +15,6 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 
-# Times by which an outlier is nearer where it has another name: by chance, two hardly are.
-_NEARER = 30.0
-
 
 def other_stops(
     problem: Problem,
@@ -109,7 +106,8 @@ def other_names(
         squares = np.full(len(pairs), np.inf)
         squares[known] = by_noise_alone(as_named.subset(known), fit)
         best = int(squares.argmin())
-        if best and _NEARER**2 * squares[best] < squares[0]:
+        # Times by which an outlier is nearer where it has another name: by chance, two hardly are.
+        if best and 30.0**2 * squares[best] < squares[0]:
             found[at] = pairs[best]
     return found
 

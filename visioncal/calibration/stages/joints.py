@@ -26,8 +26,6 @@ from visioncal.session.table import reported_matrices
 _AGREE, _CALIBRATED = (1e-3, 2e-3), (1e-2, 2e-2)
 # Half a turn of the base about its z.
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-# Outlier rows have residuals beyond this many medians.
-_OUTLIER = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,8 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
     model = robot.base_from_flange(q)
     fit = _base_and_flange(model, poses, guess)
     residuals, typical = np.array([fit.shift, fit.angle]), _typical(fit)
-    limits = np.maximum(_AGREE, _OUTLIER * typical)
+    # Outlier rows have residuals beyond this many medians.
+    limits = np.maximum(_AGREE, 7.0 * typical)
     is_outlier = np.any(residuals > limits[:, None], axis=0)
     if np.any(typical > _CALIBRATED) or is_outlier.mean() >= 0.5:
         words = (

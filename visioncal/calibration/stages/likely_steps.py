@@ -32,8 +32,6 @@ from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.robot.errors import ArmErrors
 from visioncal.vision.board_shape import SCALE
 
-# Most steps that are fitted.
-_MOST_FITTED = 6
 # Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
 _CLEARLY = 2.0 * float(np.log(100.0))
 
@@ -112,7 +110,8 @@ def likely_steps(
     drift = next((step for step in found if step.kind == DRIFT), None)
     penalty = 2.0 * float(np.log(len(problem.unknown) * (1 + problem.observations.stops.max())))
     likely = list[_Weighed]()
-    for step in found[:_MOST_FITTED]:
+    # Most steps that are fitted.
+    for step in found[:6]:
         if step.kind == DRIFT:
             continue
         try:

@@ -51,8 +51,6 @@ from visioncal.session.frames import object_name
 
 # Source of what a calibrated arm misses by the controller's own poses.
 CONTROLLER = "controller"
-# So many pairs of views are picked by at most: twenty for each of fifty views.
-_MOST_PAIRS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +340,8 @@ def _uncorrected(
         return replace(picks, offsets=offsets)
     # A robot looks in the posture of one view, and picks in that of another.
     looks, after = np.arange(len(offsets)), np.arange(1, len(offsets))
-    after = after[:: -(-len(looks) * len(after) // _MOST_PAIRS)]
+    # So many pairs of views are picked by at most: twenty for each of fifty views.
+    after = after[:: -(-len(looks) * len(after) // 1000)]
     goes = ((looks + after[:, None]) % len(looks)).ravel()
     looks = np.tile(looks, len(after))
     turn = np.zeros((len(offsets), 6, 6))

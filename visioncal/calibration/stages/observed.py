@@ -20,9 +20,6 @@ from visioncal.session.document import CameraTable
 from visioncal.session.kinds import has_robot_state
 from visioncal.vision.pnp import ViewPoses
 
-# Views of one reason that are listed.
-_LISTED = 40
-
 
 @dataclass(frozen=True, eq=False)
 class CameraObservations:
@@ -173,8 +170,9 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
     for view, reason in reasons.items():
         views[reason].append(view)
     grouped = sorted(views.items(), key=lambda item: -len(item[1]))
+    # Views of one reason that are listed.
     return tuple(
-        f"view{'s' if len(group) > 1 else ''} {some_of([*map(str, group)], _LISTED)}: {reason}"
+        f"view{'s' if len(group) > 1 else ''} {some_of([*map(str, group)], 40)}: {reason}"
         for reason, group in grouped
     )
 

@@ -36,12 +36,6 @@ from visioncal.vision.targets import (
 LOOKED_AT, LOOKED_AT_LAST = 3, 12
 # Least share of a board's corners in an image that identifies it.
 LEAST_CORNERS = 0.2
-# Paper that is looked for beyond a checkerboard [squares].
-_RIM = 0.35
-# Contrast of squares over that of paper: markers that blur hides leave half of it.
-_PLAIN = 0.75
-# Gaps between markers that differ by less are the same [sides].
-_SAME_SPACING = 0.05
 # Command that writes a copy with the images as they should be, and calibrates it.
 MEND_IMAGES = f"visioncal convert SESSION FIXED --mend-images && {CALIBRATE_FIXED}"
 # Remedy where some images are turned or scaled.
@@ -195,8 +189,9 @@ def _has_rim(image: Image, board: Target) -> bool | None:
         return False
     low, high = extent_m(board)
     along = np.linspace(0.0, 1.0, 40)[:, None]
-    # Of sides of 1 m; the next circles' centres are a distance from the outermost ones.
-    rim = 1.0 - board.diameter_m / 2 if board.kind == "circles" else _RIM
+    # Of sides of 1 m; the next circles' centres are a distance from the outermost ones. Paper that
+    # is looked for beyond a checkerboard [squares].
+    rim = 1.0 - board.diameter_m / 2 if board.kind == "circles" else 0.35
     ends = outline(board)[:, :2] + rim * np.sign(outline(board)[:, :2] - (low + high) / 2)
     sides = [a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)]
     # Middles of squares; circles are seen between them too.
@@ -211,7 +206,8 @@ def _has_rim(image: Image, board: Target) -> bool | None:
     dark, light = np.percentile(grey[-1], [25, 75])
     # On the next squares of a longer board a half of a side is dark, on circles a quarter.
     paper = [float(np.percentile(side, 20)) for side in grey[:-1] if len(side)]
-    is_plain = board.kind == "circles" or light - dark > _PLAIN * (np.median(paper) - dark)
+    # Contrast of squares over that of paper: markers that blur hides leave half of it.
+    is_plain = board.kind == "circles" or light - dark > 0.75 * (np.median(paper) - dark)
     has_paper = min(paper, default=0.0) > (dark + light) / 2 and bool(is_plain)
     return None if has_paper and len(paper) < 4 else has_paper
 
@@ -307,7 +303,8 @@ def _other_markers(declared: Target, identity: Identity) -> dict[str, object]:
     # With an odd number of rows there is one layout.
     if (board.legacy and board.rows % 2 == 0) != (declared.legacy and declared.rows % 2 == 0):
         found["legacy"] = board.legacy
-    if abs(board.spacing - declared.spacing) > _SAME_SPACING:
+    # Gaps between markers that differ by less are the same [sides].
+    if abs(board.spacing - declared.spacing) > 0.05:
         found["spacing"] = round(board.spacing, 2)
     if "border" in keys and board.border != declared.border:
         found["border"] = board.border

@@ -24,8 +24,6 @@ from visioncal.session.frames import edge_names
 from visioncal.session.table import reported_matrices
 
 _OTHERS = ("camera", "cameras", "mount", "target", "targets", "robot", "robots", "frames", "prior")
-# Noise of the instrument, far under that of the arm, which is estimated with it [m].
-_NONE_M = 1e-6
 _EDGES = edge_names("instrument")
 
 
@@ -56,8 +54,9 @@ def as_instrument(session: Session) -> Session:
         names.get(edge, edge): table for edge, table in session.document.get("prior", {}).items()
     }
     document = {key: value for key, value in session.document.items() if key not in _OTHERS}
+    # Noise of the instrument, far under that of the arm, which is estimated with it [m].
     return session.with_content(
-        document={**document, "instrument": {"sigma_m": _NONE_M}, "prior": prior},
+        document={**document, "instrument": {"sigma_m": 1e-6}, "prior": prior},
         columns=columns,
         cells=cells,
         target_document=None,

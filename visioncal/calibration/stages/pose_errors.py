@@ -23,12 +23,6 @@ from visioncal.fit.kernels import Process, StopErrors, processes
 from visioncal.fit.processes import weigh
 from visioncal.robot.errors import ArmErrors
 
-# Least share of a model's evidence, and most columns that represent the errors of all stops; the
-# remainder counts as noise.
-_NO_SHARE, _MOST_COLUMNS = 1e-4, 360
-# Least information of stops on a combination of these, over its prior, and most combinations.
-_FAINT, _MOST_COMBINED = 0.1, 96
-
 
 def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -> ArmErrors | None:
     """Errors of an arm without joint angles, and noise beside them, averaged over all models.
@@ -60,7 +54,9 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         return None
     logs = np.array(logs_of)
     shares = np.exp(logs - np.logaddexp.reduce(logs))
-    shares[shares < _NO_SHARE] = 0.0
+    # Least share of a model's evidence, and most columns that represent the errors of all stops;
+    # the remainder counts as noise.
+    shares[shares < 1e-4] = 0.0
     shares /= shares.sum()
     squares = dict.fromkeys(kinds, 0.0)
     for one, share in zip(models, shares.tolist(), strict=True):
@@ -75,7 +71,7 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         [(kind, square) for kind, square in squares.items() if square and kind.is_of_time is lasts]
         for lasts in (False, True)
     ]
-    most = _MOST_COLUMNS // 6 // max(sum(map(bool, parts)), 1)
+    most = 360 // 6 // max(sum(map(bool, parts)), 1)
     by_posture, in_time = (
         _informative(*_columns(part, len(posed), np.unique(at), most), noise_sq) for part in parts
     )
@@ -164,6 +160,7 @@ def _informative(
     scale = np.repeat(np.sqrt(noise_sq + left), 3)[:, None]
     white = (columns / scale).reshape(-1, columns.shape[2])
     values, vectors = np.linalg.eigh(white.T @ white)
-    kept = (values > _FAINT) & (np.arange(len(values)) >= len(values) - _MOST_COMBINED)
+    # Least information of stops on a combination of these, over its prior, and most combinations.
+    kept = (values > 0.1) & (np.arange(len(values)) >= len(values) - 96)
     lost = np.sum((columns @ vectors[:, ~kept]) ** 2, axis=2).mean(axis=0)
     return columns @ vectors[:, kept], left + lost.reshape(2, 3).mean(axis=1)

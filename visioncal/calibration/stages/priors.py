@@ -16,8 +16,6 @@ from visioncal.session.document import PriorTable
 from visioncal.session.tree import Tree, check_prior
 
 _AXES = ("x_m", "y_m", "z_m")
-# Prior sigma of a position that is overruled by any estimate that is accepted [m].
-_LOOSE_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,8 @@ def prior_of(name: str, table: PriorTable, tree: Tree) -> FramePrior:
 
 def with_loose_positions(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
     """The priors with position sigmas so large that the observations overrule them."""
-    return tuple(replace(prior, sigma_m=max(prior.sigma_m, _LOOSE_M)) for prior in priors)
+    # Prior sigma of a position that is overruled by any estimate that is accepted [m].
+    return tuple(replace(prior, sigma_m=max(prior.sigma_m, 1.0)) for prior in priors)
 
 
 def without_most_contradicted(fit: Fit) -> tuple[FramePrior, ...] | None:

@@ -26,9 +26,8 @@ T = TypeVar("T", bound=Observed)
 _APART_PX = 0.01
 # Numbers of a pose (3, 4) by which rows of one stop may differ [rad, m].
 _UNITS = np.array([np.deg2rad(APART_DEG)] * 3 + [1e-3 * APART_MM])
-# Images of one stop that are enough for a mean, and the greatest distance of half of the corners of
-# one of them from that of most [px]: beyond, the arm did not stand still.
-_MANY, _STANDING_PX = 4, 0.5
+# Images of one stop that are enough for a mean.
+_MANY = 4
 
 
 def without_repeats(seen: T) -> T:
@@ -126,7 +125,9 @@ def _mean_of(images: Sequence[Corners]) -> tuple[Corners, list[int]]:
             weights[at, places] = image.weights
     middle = np.nanmedian(px, axis=0)
     away = np.nanmedian(np.linalg.norm(px - middle, axis=2), axis=1)
-    standing = np.flatnonzero(away < _STANDING_PX)
+    # Greatest distance of half of the corners of an image from that of most [px]: beyond, the arm
+    # did not stand still.
+    standing = np.flatnonzero(away < 0.5)
     count = np.isfinite(px[standing, :, 0]).sum(axis=0)
     seen = 2 * count > len(standing)
     if len(standing) < _MANY or not seen.any():

@@ -25,9 +25,6 @@ from visioncal.vision.pnp import ViewPoses
 
 T = TypeVar("T", bound=Observed)
 
-# Zeros that are off by less are estimated with the arm [rad].
-_ESTIMATED_RAD = 0.1
-
 
 def read_robots(observed: T) -> T:
     """Reads the reported poses and joints of the robots.
@@ -183,7 +180,8 @@ def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> N
         guess = _guessed(matched, joints, seen, observed.held_back)
         if guess is None or not guess.stands_out:
             continue
-        if guess.zero is None or np.abs(guess.zero.zeros).max() > _ESTIMATED_RAD:
+        # Zeros that are off by less are estimated with the arm [rad].
+        if guess.zero is None or np.abs(guess.zero.zeros).max() > 0.1:
             raise _misread(observed, reported, matched, guess, "what the instrument reads")
 
 

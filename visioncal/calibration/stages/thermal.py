@@ -52,8 +52,6 @@ TEMPERATURES = "temperatures"
 # what others do is dead, where these warm up by so much [K]; an arm that begins with so much of its
 # whole rise has been at work.
 _HOT_C, _DEAD, _WARM_K, _STARTED = 65.0, 1e-3, 10.0, 0.4
-# In so long a time at the start, joints at rest change by less [s, K].
-_EARLY_S, _EVEN_K = 300.0, 0.25
 # Points of the reported course.
 _COURSE_POINTS = 200
 
@@ -319,10 +317,11 @@ def doubts(fit: ThermalFit) -> Iterator[Finding]:
             ),
         )
     above = signal[0] - inputs.ambient_c[0]
-    early = signal[inputs.stamps_s <= inputs.stamps_s[0] + _EARLY_S]
+    # In so long a time at the start, joints at rest change by less [s, K].
+    early = signal[inputs.stamps_s <= inputs.stamps_s[0] + 300.0]
     halves = early[: len(early) // 2], early[len(early) // 2 :]
     is_changing = (
-        len(early) > 1 and abs(np.subtract(*(at.mean(axis=0) for at in halves))).max() > _EVEN_K
+        len(early) > 1 and abs(np.subtract(*(at.mean(axis=0) for at in halves))).max() > 0.25
     )
     started = max(_WARM_K, _STARTED * float(signal.max() - inputs.ambient_c[0]))
     if inputs.ambient_c.any() and is_changing and above.max() > started:

@@ -21,7 +21,6 @@ from visioncal.core.files import MOST_BYTES, decode_text, read_bytes
 Array: TypeAlias = npt.NDArray[Any]
 
 
-_LEAST_SIDE = 64  # Of a picture [px].
 _OPAQUE = "its values are a table or other objects of MATLAB"
 
 
@@ -70,7 +69,8 @@ def pictures_in(path: Path) -> dict[str, tuple[int, ...]]:
                 header = header if version == (1, 0) else np.lib.format.read_array_header_2_0
                 shape, _, kind = header(member)
                 sides = shape[:-1] if shape[-1:] == (3,) else shape
-                if kind == np.uint8 and len(sides) in (2, 3) and min(sides[-2:]) >= _LEAST_SIDE:
+                # Sides of a picture [px].
+                if kind == np.uint8 and len(sides) in (2, 3) and min(sides[-2:]) >= 64:
                     found[name.removesuffix(".npy")] = shape
     return found
 

@@ -31,8 +31,8 @@ _DEAD_S = 4
 # Clients that may wait before one of them says where it stands.
 _MOST_WAITING = 8
 _SLICE_S = 0.05
-# Longest line in, and longest answer out [bytes].
-_MAX_LINE, _MAX_ANSWER = 500, 200
+# Longest line in [bytes].
+_MAX_LINE = 500
 _ENDS = re.compile(rb"[\r\n]")
 # Meaningless characters of a client's line: blanks, and the zeros of a character array.
 _FILL = b" \t\r\n\0"
@@ -213,7 +213,8 @@ class SocketArm:
         with self._dropped_if_lost(link):
             # A line before the answer did not wait for it.
             link.receive()
-            link.send(words[: _MAX_ANSWER - 1])
+            # Longest answer, without its end [bytes].
+            link.send(words[:199])
             link.refuse_more()
         self._idle.restart()
         if answer in ("next", "done") and self._stop is not None:

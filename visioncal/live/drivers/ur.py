@@ -42,8 +42,6 @@ _CALL_S = 0.9
 _LEAST_HZ, _KICK_S = 1.0, 0.1
 # Timeout of the start of an asynchronous motion [s].
 _BEGIN_S = 0.5
-# Silence after which a controller, which sends every 8 ms, counts as lost [s].
-_SILENCE_S = 0.8
 # The client library's limits [rad/s, rad/s^2].
 _SPEED_LIMIT, _ACCELERATION_LIMIT = 3.14, 40.0
 
@@ -59,8 +57,6 @@ _VARIABLES = (
 # Variables of newer controllers, and the first version, by major version.
 _PAYLOAD = ("payload", "payload_cog")
 _REPORTS_PAYLOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
-# RTDE's `robot_mode` in which joints report their positions: idle, backdrive, running.
-_REPORTING = (5, 6, 7)
 T = TypeVar("T")
 # Python exceptions for the C++ ones that the library throws.
 _THROWN = (RuntimeError, ValueError)
@@ -155,7 +151,8 @@ class StateStream:
         if stamp != self._newest:
             self._newest = stamp
             self._silence.restart()
-        return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
+        # Silence after which a controller, which sends every 8 ms, counts as lost [s].
+        return bool(self.client.isConnected()) and self._silence.read() < 0.8
 
     def check(self) -> None:
         """Checks that states arrive; raises DriverError."""
@@ -245,7 +242,8 @@ class UrArm:
         self._moves_before: int | None = None
         self._motion_timer = Stopwatch()
         self._closed = False
-        if condition.is_polyscope_x and self._states.client.getRobotMode() not in _REPORTING:
+        # RTDE's `robot_mode` in which joints report their positions: idle, backdrive, running.
+        if condition.is_polyscope_x and self._states.client.getRobotMode() not in (5, 6, 7):
             self.close()
             raise DriverError(
                 f"The {self.name} does not know where its joints are: it is not switched on.",

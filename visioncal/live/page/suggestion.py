@@ -20,8 +20,6 @@ _TILTS_DEG, _TURNS_DEG = (15.0, 32.0), (0.0, 50.0, -50.0)
 _PLACES, _DISTANCES = (-0.22, 0.0, 0.22), (0.85, 1.0, 1.25)
 # Distance of another view: as far apart as these together [rad, shares of the image, log].
 _APART = np.array([0.5, 0.35, 0.25])
-# How far from a pose that was taken another may be suggested in numbers [m, rad].
-_NEAR_M, _NEAR_RAD = 0.3, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,8 @@ def _near(flanges: FloatArray, taken: FloatArray) -> Mask:
     user knows.
     """
     apart = (distances(flanges, pose) for pose in taken)
-    near_masks = [(shifts_m < _NEAR_M) & (angles < _NEAR_RAD) for shifts_m, angles in apart]
+    # How far from a pose that was taken another may be suggested in numbers [m, rad].
+    near_masks = [(shifts_m < 0.3) & (angles < 1.0) for shifts_m, angles in apart]
     out, low = np.linalg.norm(taken[:, :3, 3], axis=1).max(), taken[:, 2, 3].min()
     is_inside = (np.linalg.norm(flanges[:, :3, 3], axis=1) <= out) & (flanges[:, 2, 3] >= low)
     return np.asarray(np.any(near_masks, axis=0) & is_inside)

@@ -8,9 +8,6 @@ from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import LensEffect, Size
 
-# Likelihood ratio of a change that moves corners by pixels: ten noises in each of some views.
-_BY_PIXELS = 400.0
-
 
 @dataclass(frozen=True, eq=False)
 class LensSteps(LensEffect):
@@ -50,7 +47,9 @@ class LensChanges(LensSteps):
     @property
     def size(self) -> Size:
         """See `Effect`: each picture shows it by pixels, or a lens that gave way is likelier."""
-        return replace(super().size, limit=_BY_PIXELS)
+        # Likelihood ratio of a change that moves corners by pixels: ten noises in each of some
+        # views.
+        return replace(super().size, limit=400.0)
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""

@@ -8,10 +8,6 @@ from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Displacement, Size
 
-# Refractive index of glass and of acrylic.
-_INDEX = 1.5
-# Likelihood ratio of a pane: a lens that departs from its model is commoner by far.
-_RARER = 40.0
 # By so much a normal is turned for its slopes [rad].
 _STEP = 1e-3
 
@@ -43,7 +39,8 @@ class Window(Displacement):
     @property
     def size(self) -> Size:
         """See `Effect`."""
-        return replace(super().size, limit=_RARER)
+        # Likelihood ratio of a pane: a lens that departs from its model is commoner by far.
+        return replace(super().size, limit=40.0)
 
     def pane(self, values: FloatArray) -> tuple[float, FloatArray]:
         """Thickness [m] and (3,) normal of (3,) values."""
@@ -77,5 +74,6 @@ class Window(Displacement):
 def nearer(points: FloatArray, normal: FloatArray) -> FloatArray:
     """(n, 3) vectors by which (n, 3) points seem nearer, for a pane of thickness one."""
     cosine = points @ normal / np.linalg.norm(points, axis=1)
-    share = 1.0 - cosine / np.sqrt(_INDEX**2 - 1.0 + cosine**2)
+    # Refractive index of glass and of acrylic.
+    share = 1.0 - cosine / np.sqrt(1.5**2 - 1.0 + cosine**2)
     return np.asarray(share[:, None] * normal)

@@ -26,8 +26,6 @@ from visioncal.verification import Check
 from visioncal.vision.camera import project
 
 _FIGURES, _LOG, _NOTE = "/figures", "/log", "/note"
-# Most plots, of the units that most moments have.
-_PLOTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +102,12 @@ def _blueprint(moments: Sequence[Moment], *, has_image: bool) -> rrb.Blueprint:
         # Of a year the viewer shows a minute, unless it is told.
         span = rr.TimeRange(start=_time(moments[0].at), end=_time(moments[-1].at))
         axis = rrb.TimeAxis(view_range=span)
+    # Most plots, of the units that most moments have.
     views: list[rrb.View] = [
         rrb.TimeSeriesView(
             name=unit, origin=f"{_FIGURES}/{unit}", axis_x=axis, plot_legend=rrb.Corner2D.RightTop
         )
-        for unit, count in counts.most_common(_PLOTS)
+        for unit, count in counts.most_common(3)
         if count > 1 or len(moments) == 1
     ]
     if has_image:

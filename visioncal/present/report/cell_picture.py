@@ -16,8 +16,8 @@ from visioncal.session import Session
 from visioncal.vision.camera import matrix_3x3
 from visioncal.vision.targets import closed_outline
 
-# Height of the picture, and what remains free at its borders [px].
-_HEIGHT, _BORDER = 340.0, 36.0
+# Height of the picture [px].
+_HEIGHT = 340.0
 # It is seen from so far above [rad].
 _ELEVATION_RAD = np.deg2rad(25.0)
 # Sides that it may be seen from.
@@ -90,7 +90,8 @@ def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray],
     between = np.linalg.norm(places[:, first] - places[:, second], axis=2)
     best = axes[int(np.argmax(between.min(axis=1, initial=np.inf)))]
     low, high = (points @ best.T).min(axis=0), (points @ best.T).max(axis=0)
-    room = np.array([WIDTH, _HEIGHT]) - 2.0 * _BORDER
+    # What remains free at the borders [px].
+    room = np.array([WIDTH, _HEIGHT]) - 2.0 * 36.0
     scale = float(np.min(room / np.maximum(high - low, 1e-9)))
     middle = 0.5 * np.array([WIDTH, _HEIGHT]) - scale * 0.5 * (low + high)
     return lambda of: np.asarray(scale * (of @ best.T) + middle)

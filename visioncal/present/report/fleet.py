@@ -14,9 +14,6 @@ from visioncal.present.report.templates import template
 from visioncal.results.history import Entry
 from visioncal.results.years import Change, Course, courses
 
-# Days after which a cell should have been checked again; weeks of notice of a need that will be
-# missed; days for which a step, or a sigma that grew, is a reason to look; and by how much it grew.
-_UNCHECKED_DAYS, _NOTICE_WEEKS, _RECENT_DAYS, _GREW = 90, 26, 365, 1.5
 _STATES = ("good", "check", "bad", "no result")
 _CHECKS = ("calibrated", "verified", "touched")
 
@@ -86,7 +83,8 @@ class FleetRow:
         now = self.now or self.entries[-1].time
         said = [Matter(rank, f"{worst.reason}{since}"), *self._changes(now)]
         days = 0 if last is None or self.now is None else (now - last.time).days
-        if days > _UNCHECKED_DAYS:
+        # A cell should have been checked again after so many days.
+        if days > 90:
             words = f"Nothing has checked it since {self.checked}, {days} days ago."
             advice = "Five stops are enough: visioncal verify SESSION --against OUT."
             said.append(Matter(5, f"{words} {advice}"))
@@ -109,7 +107,7 @@ class FleetRow:
             if course.drift is not None:
                 yield self._drifting(course, course.drift, now)
             for step in course.sigma_steps[-1:]:
-                if np.exp(step.vector[0]) > _GREW and _is_recent(course, step, now):
+                if np.exp(step.vector[0]) > 1.5 and _is_recent(course, step, now):
                     sigmas = [entry.edges[course.name].sigma_mm for entry in course.entries]
                     sides = sigmas[: step.at], sigmas[step.at :]
                     before, after = (figure(float(np.median(side))) for side in sides)
@@ -131,8 +129,9 @@ class FleetRow:
         until = "or never" if (late - now).days > 3650 else f"to {_day(late)}"
         when = f"{_day(likely)} (95 %: {_day(early)} {until})"
         weeks, need = (likely - now).days / 7.0, f"the need of {figure(needs[-1])} mm"
+        # Weeks of notice of a need that will be missed.
         return Matter(
-            2 if weeks < _NOTICE_WEEKS else 6,
+            2 if weeks < 26 else 6,
             f"{words}: by its latest pose {need} "
             + (f"is missed since {when}. " if weeks < 0 else "")
             + (f"will be missed in {weeks:.0f} weeks, on {when}. " if weeks >= 0 else "")
@@ -184,7 +183,8 @@ def page_of_history(entries: Sequence[Entry], name: str, now: datetime) -> str:
 
 
 def _is_recent(course: Course, step: Change, now: datetime) -> bool:
-    return (now - course.entries[step.at].time).days <= _RECENT_DAYS
+    # Days for which a step, or a sigma that grew, is a reason to look.
+    return (now - course.entries[step.at].time).days <= 365
 
 
 def _between(course: Course, step: Change) -> str:

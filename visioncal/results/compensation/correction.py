@@ -27,8 +27,8 @@ Poses: TypeAlias = FloatArray | RigidTransform
 # Smallest number of joints that reach any position.
 _LEAST_JOINTS = 3
 # Beyond half as much again as was seen, loads and rises of temperature are extrapolated: postures
-# of targets differ from those of stops by less. Ten times as much is no load of the same arm.
-_BEYOND, _ABSURD = 1.5, 10.0
+# of targets differ from those of stops by less.
+_BEYOND = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +157,9 @@ def unseen(
         over = (borne - _BEYOND * seen) * (elastic.compliance + elastic.sigmas)
         at = int(np.argmax(over))
         if over[at] > 0.0:
+            # Ten times as much as was seen is no load of the same arm.
             unit = "kilograms, and the centre in metres? " * bool(
-                borne.max() > _ABSURD * elastic.most_nm
+                borne.max() > 10.0 * elastic.most_nm
             )
             yield (
                 f"The payload is beyond what the calibration has seen: {elastic.joints[at].joint} "

@@ -34,8 +34,6 @@ _FEWEST = ((4, 4), (3, 3))
 _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
 # Distance from the outermost squares at which it shows whether others follow [squares].
 _RIM = 0.3
-# Share of the way from a corner to the middle of a dark square; usual circles end before.
-_TIP = 0.2
 # Share of a square around a corner within which edges refine it, and until when: by 0.01 px.
 _AROUND, _UNTIL = 0.25, (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
 # About the longer side of the image in which outlines of squares are looked for: among the noise of
@@ -293,7 +291,8 @@ def _has_tips(image: Image, grid: FloatArray) -> bool:
     levels = _at(image, middles)
     dark, light = np.percentile(levels, [25, 75])
     corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]])
-    near = _at(image, corners + _TIP * (middles - corners))[:, levels < (dark + light) / 2]
+    # Share of the way from a corner to the middle of a dark square; usual circles end before.
+    near = _at(image, corners + 0.2 * (middles - corners))[:, levels < (dark + light) / 2]
     return bool(near.size and np.median(near) < (dark + light) / 2)
 
 

@@ -30,10 +30,6 @@ from visioncal.vision.boards.template import MIN_CORNERS, Refined
 # Largest diameter over spacing of circles, so that their edges remain separate; that of those named
 # without being declared; that of requested ones, as much dark as white between them.
 _WIDEST, _NAMED, _USUAL_DIAMETER = 0.85, 0.75, 0.5
-# Threshold: window as a share of the image's shorter side, and grey levels below its mean. Blobs
-# have a minimum area [px] and fill the ellipse of their moments: squares fill 0.955, circles of few
-# pixels a little less than all of it; the median separates them.
-_SURROUNDINGS, _DARKER, _LEAST_AREA, _FILL, _ROUND = 0.12, 12, 12.0, 0.88, 0.97
 # Tolerance of predicted neighbours in steps.
 _OFF = 0.3
 # Minimum number of blobs.
@@ -226,7 +222,8 @@ def _circles(image: Image) -> tuple["Blobs", IntArray, IntArray]:
     """Dark blobs of a grey image, and the lattice and indices of those that are circles."""
     blobs = find_blobs(image)
     lattice, members = _lattice(blobs) if len(blobs.px) >= _LEAST else (np.zeros((0, 2), int),) * 2
-    if len(members) < _LEAST or np.median(blobs.fill[members]) < _ROUND:
+    # The median separates circles from squares, which fill 0.955 of the ellipse of their moments.
+    if len(members) < _LEAST or np.median(blobs.fill[members]) < 0.97:
         return blobs, np.zeros((0, 2), int), np.zeros(0, int)
     return blobs, lattice, members
 
@@ -267,15 +264,17 @@ class Blobs:
 
 def find_blobs(image: Image) -> Blobs:
     """Dark blobs of a (h, w) grey image that look like ellipses, the largest first."""
-    block = 2 * int(_SURROUNDINGS * min(image.shape) / 2) + 3
+    # The threshold's window as a share of the image's shorter side, and grey levels below its mean.
+    block = 2 * int(0.12 * min(image.shape) / 2) + 3
     dark = cv2.adaptiveThreshold(
-        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, _DARKER
+        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, 12
     )
     centres, moments, fills = [], [], []
     for contour in cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
         contour_moments = cv2.moments(contour)
         area = contour_moments["m00"]
-        if area < _LEAST_AREA:
+        # The least area of a blob [px].
+        if area < 12.0:
             continue
         covariance = (
             np.array(
@@ -287,7 +286,9 @@ def find_blobs(image: Image) -> Blobs:
             / area
         )
         ellipse = 4.0 * np.pi * np.sqrt(max(np.linalg.det(covariance), 0.0))
-        if area < _FILL * ellipse or ellipse <= 0.0:
+        # Blobs fill the ellipse of their moments: squares 0.955 of it, circles of few pixels a
+        # little less than all.
+        if area < 0.88 * ellipse or ellipse <= 0.0:
             continue
         fills.append(area / ellipse)
         centres.append((contour_moments["m10"] / area, contour_moments["m01"] / area))

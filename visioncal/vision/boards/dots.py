@@ -27,9 +27,8 @@ _COLUMNS = ("point", "x_m", "y_m", "radius_m")
 _RADIUS, _LARGER, _SHIFT, _CELLS = 0.14, 0.22, 0.2, (14, 9)
 # Number of larger dots, and least radius of these over the median.
 _LARGE, _LEAST_RATIO = 4, 1.3
-# Tolerance of predicted dots, as a share of the distance to the next one; rounds of matching; and
-# matched neighbours that predict how the lens shifts a dot.
-_OFF, _ROUNDS, _NEAR = 0.35, 8, 3
+# Tolerance of predicted dots, as a share of the distance to the next one; rounds of matching.
+_OFF, _ROUNDS = 0.35, 8
 
 
 @dataclass(frozen=True)
@@ -193,7 +192,8 @@ class Dots(PointsKind, Board):
                 break
             predicted = _mapped(fit, places)
             shifts = blobs.px[best[:, 1]] - predicted[best[:, 0]]
-            near = cKDTree(places[best[:, 0]]).query(places, min(_NEAR, len(best)))[1]
+            # Matched neighbours that predict how the lens shifts a dot.
+            near = cKDTree(places[best[:, 0]]).query(places, min(3, len(best)))[1]
             predicted = predicted + shifts[near].reshape(len(places), -1, 2).mean(axis=1)
             # In the last round a wrong dot is as far from its place as any.
             best = _matched(predicted, tree, 0.12 if at == _ROUNDS - 1 else _OFF)

@@ -32,12 +32,6 @@ from visioncal.vision.boards.layout import (
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
 from visioncal.vision.boards.template import SQUARE
 
-# Error of a print's gaps, as a share of a side.
-_TRUE = 0.01
-# Dark modules around bits, at most; the gap between markers that detectors need, at most, and
-# usually, as shares of their side.
-_MOST_BORDER, _LEAST_SPACING, _MOST_SPACING, _USUAL_SPACING = 2, 0.04, 4.0, 0.3
-
 
 class GridBoard(BoardKind):
     """A grid of lone markers. Its origin is the outer corner of the marker at the upper left."""
@@ -66,12 +60,14 @@ class GridBoard(BoardKind):
             spacing = table.number("spacing_m", positive=True) / size_m
         else:
             spacing = table.number("spacing", positive=True)
-        if spacing > _MOST_SPACING:
+        # Largest gap between markers, as a share of a side.
+        if spacing > 4.0:
             raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3")
         dictionary = table.text("dictionary", *filter(None, [self.usual_dictionary]))
         size = f"{columns} x {rows} {self.sides}"
         first = first_id(table, columns * rows, size, dictionary)
-        border = table.integer("border", 1, _MOST_BORDER, self.usual_border)
+        # Most dark modules around bits.
+        border = table.integer("border", 1, 2, self.usual_border)
         return Target(
             name,
             self.name,
@@ -132,7 +128,7 @@ class GridBoard(BoardKind):
         optional = {"first_id": request.marker_id, "border": request.border}
         return super().requested(request, square_mm) | {
             "dictionary": request.dictionary or APRILGRID_DICTIONARY,
-            "spacing": _USUAL_SPACING if request.spacing is None else request.spacing,
+            "spacing": 0.3 if request.spacing is None else request.spacing,
             **{key: value for key, value in optional.items() if value is not None},
         }
 
@@ -187,8 +183,9 @@ class GridBoard(BoardKind):
         off = 0.02 + 2.0 * (1.0 + target.spacing) * off_px / side_px
         if abs(1.0 / share - 1.0 - target.spacing) <= off:
             return ""
-        # No print has gaps of so small a share: they are metres.
-        unit = ", which looks like metres" if target.spacing < _LEAST_SPACING else ""
+        # No print has gaps of so small a share: they are metres. Detectors need this share of a
+        # side between markers.
+        unit = ", which looks like metres" if target.spacing < 0.04 else ""
         return (
             f"the tags are {1.0 / share - 1.0:.2f} of their side apart, and the target says "
             f"spacing = {target.spacing:g}{unit}"
@@ -209,8 +206,9 @@ class GridBoard(BoardKind):
         seen = [self.whole(target, *view) for view in zip(ids, px, strict=True)]
         share, scatter = side_share(*zip(*seen, strict=True))
         spacing = 1.0 / share - 1.0
-        # A print's gaps are true to a hundredth of a side, unless corners scatter by more.
-        is_other = abs(spacing - target.spacing) > max(_TRUE, scatter)
+        # A print's gaps are true to a hundredth of a side, unless corners scatter by more. Error of
+        # a print's gaps, as a share of a side.
+        is_other = abs(spacing - target.spacing) > max(0.01, scatter)
         return {"spacing": round(spacing, 2)} if is_other else {}
 
 

@@ -23,15 +23,7 @@ from visioncal.vision.targets import board_words
 
 # Fewer markers are single ones.
 _LEAST_MARKERS = 4
-# Printable boards of markers have fewer columns.
-_MOST_COLUMNS = 40
-# Steps between markers up to this length, and this close to whole ones, are counted [steps].
-_NEAR, _OFF = 2.5, 0.3
-# Least correlation of tags with their ideals.
-_LEAST_LIKENESS = 0.65
 _MAY_HAVE_MORE = "On some side no image shows where it ends: it may have more columns or rows."
-# Images with more pixels are looked at in a copy of about so many first: details hide boards.
-_MANY_PX, _ENOUGH_PX = 8e6, 2e6
 
 
 @dataclass(frozen=True)
@@ -90,8 +82,9 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
     for picture in pictures:
         check_grey(picture)
     sets = [pictures]
-    if max(picture.size for picture in pictures) > _MANY_PX:
-        small = [resized(each, min((_ENOUGH_PX / each.size) ** 0.5, 1.0)) for each in pictures]
+    # Images with more pixels are looked at in a copy of about so many first: details hide boards.
+    if max(picture.size for picture in pictures) > 8e6:
+        small = [resized(each, min((2e6 / each.size) ** 0.5, 1.0)) for each in pictures]
         sets = [small, pictures]
     for shown in sets:
         look = _Look(shown, declared)
@@ -218,8 +211,9 @@ class _Look:
         rows = layout.rows + (legacy and layout.rows % 2)
         count = layout.first + layout.columns * rows // (2 if has_squares else 1)
         names = holding(grid.family, max(count, int(ids.max()) + 1))
-        # Of tags with squares at their corners, the bits of another border read by chance.
-        blurred = kind.name == "aprilgrid" and np.median(grid.likeness[grid.fits]) < _LEAST_LIKENESS
+        # Of tags with squares at their corners, the bits of another border read by chance. Least
+        # correlation of tags with their ideals.
+        blurred = kind.name == "aprilgrid" and np.median(grid.likeness[grid.fits]) < 0.65
         if not names or blurred or not 0.2 < share < 0.98:
             return
         expected = "" if self.declared is None else self.declared.dictionary
@@ -346,8 +340,10 @@ class _Grid:
         # The nearest marker is one step away, where it is read.
         unit = max(float(np.quantile(lengths.min(axis=1), 0.25)), 1e-9)
         whole = np.rint(steps / unit)
-        near = whole.any(axis=2) & (lengths < _NEAR * unit)
-        near &= (np.abs(steps / unit - whole) < _OFF).all(axis=2)
+        # Steps between markers up to this length, and this close to whole ones, are counted
+        # [steps].
+        near = whole.any(axis=2) & (lengths < 2.5 * unit)
+        near &= (np.abs(steps / unit - whole) < 0.3).all(axis=2)
         near &= (whole == -np.swapaxes(whole, 0, 1)).all(axis=2)
         return rows[np.argwhere(near)], whole[near]
 
@@ -371,7 +367,8 @@ class _Grid:
         """Layouts that predict the most steps, the likeliest first."""
         votes: dict[_Layout, int] = {}
         for kind in KINDS.values():
-            for columns in range(1, _MOST_COLUMNS + 1):
+            # Printable boards of markers have fewer columns.
+            for columns in range(1, 41):
                 for rest in range(columns):
                     variants = kind.marker_places(self.ids - rest, columns)
                     for variant, places in enumerate(variants):

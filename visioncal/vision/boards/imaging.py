@@ -20,8 +20,6 @@ _REACH_PX = (4, 12)
 _STRIP = 256
 # Minimum contrast that detectors need [grey levels].
 _LEAST_CONTRAST = 12
-# EXIF's tag of the orientation.
-_ORIENTATION = 0x0112
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 _SIGNATURES = (b"\x89PNG", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM", b"RIFF")
 # Instruction for an image in colour.
@@ -79,7 +77,8 @@ def exif_turn(data: bytes) -> int | None:
 
     with Pillow.open(io.BytesIO(data), formats=_FORMATS) as header:
         turns = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
-        return turns.get(header.getexif().get(_ORIENTATION, 1))
+        # EXIF's tag of the orientation.
+        return turns.get(header.getexif().get(0x0112, 1))
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:

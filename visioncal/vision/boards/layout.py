@@ -28,9 +28,8 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "mip": ("DICT_ARUCO_MIP_36h12",),
     **{code: (f"DICT_APRILTAG_{code}",) for code in ("16h5", "25h9", "36h10", "36h11")},
 }
-# Pixels per module in the comparison of a marker with its ideal, and white margin that it includes
-# [modules]: half of the required one.
-_MODULE_PX, _RING = 4, 0.5
+# Pixels per module in the comparison of a marker with its ideal.
+_MODULE_PX = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +97,8 @@ def decoded(
 def _likeness(image: Image, px: FloatArray, family: str, number: int, border: int) -> float:
     """Correlation of the image of a marker with the ideal marker."""
     dictionary = aruco_dictionary(FAMILIES[family][-1])
-    side, ring = (dictionary.markerSize + 2 * border) * _MODULE_PX, round(_RING * _MODULE_PX)
+    # White margin that the comparison includes [modules]: half of the required one.
+    side, ring = (dictionary.markerSize + 2 * border) * _MODULE_PX, round(0.5 * _MODULE_PX)
     ideal = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=border)
     ideal = np.pad(ideal, ring, constant_values=255)
     # Pixel centres are at integers; the marker's edge is half a pixel before the first one.

@@ -33,20 +33,14 @@ from visioncal.vision.hard_matches import Features, hard_matches, is_installed
 if TYPE_CHECKING:
     from visioncal.vision.register.image_model import Print
 
-# Longest side of a picture that is kept [px]: a camera resolves no more of a print in its view.
-_LONGEST_PX = 1600
-# Number of patches, features of an image and of the picture itself, whose clearest are finer than
-# an image shows, and features that agree where the picture is seen: twice those of a homography.
-_PATCHES, _FEATURES, _OWN_FEATURES, _FEWEST = 120, 2500, 20_000, 8
+# Number of patches, features of an image, and features that agree where the picture is seen: twice
+# those of a homography.
+_PATCHES, _FEATURES, _FEWEST = 120, 2500, 8
 # Long sides of the copies of images that are searched, the quicker one first, and pixels of a print
 # that are registered, within a factor of 2.25.
 _SEARCHED_PX, _REGISTERED = (500, 1000), 1.6e5
-# Correlation of a picture with itself, turned or shifted, from which on it looks the same, and the
-# least spread of its grey levels.
-_SAME, _PLAIN = 0.9, 4.0
-# Least share of the image's variance that a picture explains, and blur from which on its shape is
-# sought [px].
-_EXPLAINED, _BLURRED_PX = 0.8, 1.5
+# Least spread of a picture's grey levels.
+_PLAIN = 4.0
 
 
 @dataclass(frozen=True)
@@ -169,11 +163,13 @@ class Picture(BoardKind):
         factors, sigma, found = (2 * factor, factor), usual_sigma(lens), None
         for rough in (False, True):
             # Of wide blurs the shape counts.
-            if found is None or found.seen.gauss_px > _BLURRED_PX * factor:
+            if found is None or found.seen.gauss_px > 1.5 * factor:
                 found = register(
                     image, print_, lens, Seen(pose), lens_sigma=sigma, factors=factors, rough=rough
                 )
-        if found is None or found.explained < _EXPLAINED:
+        # Least share of the image's variance that a picture explains, and blur from which on its
+        # shape is sought [px].
+        if found is None or found.explained < 0.8:
             return "the picture is another one: features agree, and all pixels do not"
         half_m = 0.5 * target.square_m / target.columns
         ids, px, sigma_px = places_of(found, self.corners(target), half_m)
@@ -200,7 +196,8 @@ def kept_picture(path: Path) -> str:
     grey = decode_image(data)
     if isinstance(grey, str):
         raise DataError(f"{path} is {grey}.", culprits=[str(path)])
-    shrink = _LONGEST_PX / max(grey.shape)
+    # Longest side of a picture that is kept [px]: a camera resolves no more of a print in its view.
+    shrink = 1600 / max(grey.shape)
     if shrink < 1.0:
         grey = resized(grey, shrink)
     elif data.startswith(b"\xff\xd8\xff"):
@@ -294,7 +291,8 @@ def _known(target: PictureTarget) -> _Known:
 
     grey = Picture().picture(target)
     assert grey is not None
-    features = features_of(grey, _OWN_FEATURES)
+    # The clearest features of the picture itself are finer than an image shows.
+    features = features_of(grey, 20_000)
     return _Known(Print.of_picture(grey, target.square_m), features, unfit(grey, len(features.px)))
 
 
@@ -322,4 +320,5 @@ def unfit(grey: Image, features: int | None = None) -> str:
 def _alike(a: FloatArray, b: FloatArray) -> bool:
     if min(a.std(), b.std()) < 0.1 * _PLAIN:
         return False
-    return bool(np.corrcoef(a.ravel(), b.ravel())[0, 1] > _SAME)
+    # From this correlation on a picture, turned or shifted, looks the same as itself.
+    return bool(np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.9)

@@ -35,8 +35,6 @@ BLOCK_PX = 8
 # sampling at each pixel aliases by less than noise does; and the narrowest of an image, as its
 # pixels alone are boxes of 0.29.
 _SAMPLED_PX, _SHARPEST_PX = 0.5, 0.32
-# Cosine of a print's tilt below which a Gaussian on it, as wide along as across, is too rough.
-_SLANTED = 0.85
 # Frequencies of a kernel.
 _FREQUENCIES = 64
 
@@ -242,8 +240,9 @@ class Level:
         pixel_m = self.factor * float(middle[2] / self.camera.matrix[:2].mean())
         # A slanted pixel sees more of the print along one direction.
         slant = abs(float(pose[:3, 2] @ middle)) / float(np.linalg.norm(middle))
-        # Four places within a pixel leave less to a Gaussian on the print.
-        within, sampled_px = (0.0, _SAMPLED_PX) if moving or slant > _SLANTED else (0.25, 0.35)
+        # Four places within a pixel leave less to a Gaussian on the print. Cosine of a print's tilt
+        # below which a Gaussian on it, as wide along as across, is too rough.
+        within, sampled_px = (0.0, _SAMPLED_PX) if moving or slant > 0.85 else (0.25, 0.35)
         first, second, by, sigma_m = flat.blurred(sampled_px * pixel_m / max(slant, 0.2) ** 0.5)
         count = 1 + 2 * moving * int(
             np.clip(moved_px(self.camera, flat, seen) / self.factor / 3, 2, 6)
