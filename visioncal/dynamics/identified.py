@@ -25,6 +25,7 @@ from visioncal.dynamics.statistics import Lag, StreamStatistics, TorqueValidatio
 from visioncal.robot import Robot
 from visioncal.robot.files import robot_names
 from visioncal.robot.inertia import Inertias
+from visioncal.robot.loads import STANDARD_GRAVITY_M_S2
 
 # Classes of a parameter's relative sigma; beyond the last it is not determined.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
@@ -116,10 +117,6 @@ class Identified:
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
 
 
-# Standard gravity, for masses by their weight [m/s^2].
-_GRAVITY_M_S2 = 9.80665
-
-
 def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
     return "check", Finding(kind, words, do)
 
@@ -166,7 +163,7 @@ def _of_size(identified: Identified) -> Iterator[_Judged]:
     push = float(np.linalg.norm(motion.ddq, axis=1).max())
     # A torque is at most that of all of the mass at the full reach.
     mass_kg = max(
-        float(np.abs(by_weight).max()) / (_GRAVITY_M_S2 * reach_m),
+        float(np.abs(by_weight).max()) / (STANDARD_GRAVITY_M_S2 * reach_m),
         float(np.abs(by_inertia - by_weight).max()) / (push * reach_m**2),
     )
     # Mass at the full reach that would have an arm's torques, over the cube of the reach [kg/m^3].

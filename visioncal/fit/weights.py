@@ -16,16 +16,12 @@ from visioncal.fit.pairs import Pair
 from visioncal.fit.unknowns import State, Unknowns
 from visioncal.model import Cell
 from visioncal.vision.camera import normalise
+from visioncal.vision.gating import CORNER_FLOOR_PX, CORNER_SIGMAS, VIEW_FLOOR_PX, VIEW_RATIO
 from visioncal.vision.targets import corner_positions
 from visioncal.vision.viewnoise import weights_by_view
 
-# Lens and board leave residuals that differ by four within a view, and views differ in noise by two
-# or three: a wrong corner is off by a good part of a square, and wrong views are off by more.
-_CORNER_SIGMAS, _VIEW_RATIO = 8.0, 5.0
 # Wrong corners hide each other from this on, since the fit follows them.
 _SUSPECT = 4.0
-# Less does no harm [px]: of a corner, of a view.
-_CORNER_PX, _VIEW_PX = 0.5, 1.0
 # Fewest corners among which a wrong one shows.
 _FEWEST = 8
 # Residuals of exact corners are rounding errors [px].
@@ -99,9 +95,9 @@ def by_homography(points: FloatArray, px: FloatArray, weights: FloatArray | None
             return _Judged(agreeing, 0.0, 0)
         off = cv2.perspectiveTransform(flat[:, None], found)[:, 0] - px
         lengths = each * np.linalg.norm(off, axis=1)
-        if inside.all() and method == 0 and _within(lengths, _CORNER_PX, _SUSPECT).all():
+        if inside.all() and method == 0 and _within(lengths, _SUSPECT).all():
             break
-        inside = _within(lengths, _CORNER_PX)
+        inside = _within(lengths)
     agreeing[known] = inside
     return _Judged(agreeing, float(np.sum(lengths[inside] ** 2)), 2 * int(inside.sum()) - 8)
 
@@ -130,12 +126,12 @@ def _by_own_pose(rows: FloatArray) -> _Judged:
     if len(rows) < _FEWEST:
         return _Judged(inside, 0.0, 0)
     lengths = _beside_pose(rows, inside)
-    if not _within(lengths, _CORNER_PX, _SUSPECT).all():
+    if not _within(lengths, _SUSPECT).all():
         for _ in range(10):
             # Cauchy's weights find the pose of most: each round divides what a wrong corner pulls.
             far = lengths / (2.0 * max(float(np.median(lengths)), _EXACT_PX))
             lengths = _beside_pose(rows, 1.0 / np.sqrt(1.0 + far**2))
-        inside = _within(lengths, _CORNER_PX)
+        inside = _within(lengths)
         lengths = _beside_pose(rows, inside)
     return _Judged(inside, float(np.sum(lengths[inside] ** 2)), 2 * int(inside.sum()) - 6)
 
@@ -147,11 +143,11 @@ def _beside_pose(rows: FloatArray, weights: FloatArray | Mask) -> FloatArray:
     return np.asarray(np.linalg.norm(rows[:, :, 6] - rows[:, :, :6] @ step, axis=1))
 
 
-def _within(lengths: FloatArray, least_px: float, sigmas: float = _CORNER_SIGMAS) -> Mask:
+def _within(lengths: FloatArray, sigmas: float = CORNER_SIGMAS) -> Mask:
     """(n,) corners of one view whose (n,) residual lengths are those of noise [px]."""
     # The median length of a two-dimensional Gaussian is 1.18 sigma (Rayleigh).
     sigma = float(np.median(lengths)) / np.sqrt(2.0 * np.log(2.0))
-    return np.asarray(lengths <= max(sigmas * sigma, least_px))
+    return np.asarray(lengths <= max(sigmas * sigma, CORNER_FLOOR_PX))
 
 
 def _weighed(cell: Cell, judged: Mapping[int, _Judged]) -> Weighed:
@@ -165,7 +161,7 @@ def _weighed(cell: Cell, judged: Mapping[int, _Judged]) -> Weighed:
         squares = np.array([judged[row].square for row in rows])
         freedom = np.array([float(judged[row].freedom) for row in rows])
         sigmas = np.sqrt(2.0 * squares / freedom)
-        inside = sigmas <= max(_VIEW_RATIO * float(np.median(sigmas)), _VIEW_PX)
+        inside = sigmas <= max(VIEW_RATIO * float(np.median(sigmas)), VIEW_FLOOR_PX)
         sound[np.array(rows)[~inside]] = False
         is_exact = np.median(sigmas) <= _EXACT_PX
         by_view = None if is_exact else weights_by_view(squares[inside], freedom[inside])

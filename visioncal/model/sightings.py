@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Corners, FloatArray
-from visioncal.session.observations import APART_DEG, APART_MM
+from visioncal.session.observations import APART_DEG, APART_MM, APART_PX
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +39,6 @@ class MeasuredPlace:
 
 Evidence: TypeAlias = Corners | MeasuredPose | MeasuredPlace
 
-# Corners of two exposures differ by more in some corner [px]; a picture stored anew does not.
-_APART_PX = 0.01
-
 
 def is_copy(one: Evidence, other: Evidence, *, is_anew: bool) -> bool:
     """Whether two pieces of evidence of one stop are the same reading.
@@ -51,7 +48,7 @@ def is_copy(one: Evidence, other: Evidence, *, is_anew: bool) -> bool:
     """
     if isinstance(one, Corners) and isinstance(other, Corners):
         same = np.array_equal(one.ids, other.ids)
-        return same and bool(np.abs(one.px - other.px).max(initial=0.0) < _APART_PX)
+        return same and bool(np.abs(one.px - other.px).max(initial=0.0) < APART_PX)
     if isinstance(one, MeasuredPose) and isinstance(other, MeasuredPose):
         mm, deg = pose_difference(one.matrix, other.matrix)
         is_near = one.is_of_board and not is_anew and mm < APART_MM and deg < APART_DEG

@@ -32,7 +32,7 @@ from visioncal.planning.information import (
     with_arm_errors,
     workspace_jacobian,
 )
-from visioncal.planning.path import left_candidates, order_stops
+from visioncal.planning.path import ROUNDS, left_candidates, order_stops
 from visioncal.planning.purposes import Purpose
 from visioncal.planning.visibility import Occlusion
 from visioncal.robot.errors import TWIST_UNITS
@@ -142,8 +142,7 @@ def plan_for_instrument(
     left = np.arange(len(candidates))
     with one_blas_thread():
         world = _world(cell, purpose, candidates, recorded)
-        # Most rounds in which stops without a safe path are replaced.
-        for attempt in range(12):
+        for attempt in range(ROUNDS):
             design = choose_stops([world.of_candidates(left)], count, criterion)
             q = candidates[left[design.rows]]
             route = order_stops(cell, start_q, q, seed)

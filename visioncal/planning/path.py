@@ -10,6 +10,9 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.planning.cell import AnyCell
 from visioncal.robot.collision import Collisions
 
+# Most rounds in which stops without a safe path are replaced: an arm that folds far back needs up
+# to six for 8 to 30 stops.
+ROUNDS = 12
 # Draws per search, and the length of one step [rad].
 _DRAWS, _STEP_RAD = 120, 0.7
 # How far a detour may leave the joint box of both postures [rad].

@@ -17,7 +17,7 @@ from visioncal.planning.candidates import Candidates, candidates
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.design import Accuracy, Design, choose_stops
 from visioncal.planning.information import WORLDS, World, predict_worlds
-from visioncal.planning.path import Route, left_candidates, order_stops
+from visioncal.planning.path import ROUNDS, Route, left_candidates, order_stops
 from visioncal.planning.pick_probability import (
     NeedPlanned,
     Picking,
@@ -27,11 +27,6 @@ from visioncal.planning.pick_probability import (
 )
 from visioncal.planning.purposes import Purpose, purpose_of
 from visioncal.planning.recorded import SessionStart
-
-# Most rounds in which stops without a safe path are replaced: an arm that folds far back needs up
-# to six for 8 to 30 stops.
-_ROUNDS = 12
-
 
 StoredPurpose = Annotated[
     Purpose, WrittenForm(lambda purpose: purpose.name, lambda name, _: purpose_of(name))
@@ -185,9 +180,9 @@ class _Planning:
         """Stops that a safe path connects, the path, and what blocked the stops left out for it."""
         remaining = np.arange(len(self.found.q))
         blockers: list[str] = []
-        for attempt in range(_ROUNDS):
+        for attempt in range(ROUNDS):
             design = self._smallest_design(remaining)
-            progress("path", attempt, _ROUNDS)
+            progress("path", attempt, ROUNDS)
             q = self.found.q[design.rows]
             route = order_stops(self.cells[0], self.request.start_q, q, self.request.seed)
             if not route.unreachable:
@@ -198,7 +193,7 @@ class _Planning:
             )
         obstacles = tuple(dict.fromkeys(blockers))
         raise DataError(
-            f"plan: no safe way through {self.request.count} stops was found in {_ROUNDS} choices; "
+            f"plan: no safe way through {self.request.count} stops was found in {ROUNDS} choices; "
             f"in the way were {some_of(list(obstacles))}.",
             culprits=obstacles,
             next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",

@@ -9,6 +9,9 @@ from visioncal.core.types import FloatArray
 from visioncal.robot.loads import Loads
 from visioncal.robot.model import Robot
 
+# Prior of a compliance of which nothing is known: a gear of 10 kN m/rad [rad/(N m)].
+SOFT = 1e-4
+
 
 def deflected_joints(
     robot: Robot,

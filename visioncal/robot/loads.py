@@ -16,6 +16,7 @@ from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
+STANDARD_GRAVITY_M_S2 = 9.80665
 # Most that any arm carries [kg], and how far from its flange at most the centre of that is [m].
 MOST_KG, MOST_CENTRE_M = 2500.0, 3.0
 # Keys of a link's mass in a joint's table.
@@ -154,7 +155,7 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
         DataError: It is no vector of three numbers, or not that of the Earth.
     """
     if "gravity_m_s2" not in document:
-        return np.array([0.0, 0.0, -9.80665])
+        return np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
     row = DocumentTable(document, label)
     gravity = np.array(row.numbers("gravity_m_s2", 3))
     if not 9.5 < float(np.linalg.norm(gravity)) < 10.1:

@@ -16,6 +16,9 @@ from visioncal.session.table import View
 
 # Largest difference between reports of one robot's pose at one stop [mm, deg, rad].
 APART_MM, APART_DEG, APART_RAD = 1.0, 0.1, 2e-3
+# Corners of two exposures of one scene differ by the camera's noise in some corner, by more than
+# this [px]; a picture that was stored anew in another file does not.
+APART_PX = 0.01
 
 
 @dataclass(frozen=True, eq=False)

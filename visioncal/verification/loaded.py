@@ -23,7 +23,7 @@ from visioncal.results import Calibration
 from visioncal.results.arm import ElasticResult, JointSpring, Sag
 from visioncal.robot import Loads
 from visioncal.robot.arm_model import COMPLIANCE, ArmModel
-from visioncal.robot.elasticity import weight_words
+from visioncal.robot.elasticity import SOFT, weight_words
 from visioncal.robot.loads import load_ranges
 from visioncal.session import Session
 from visioncal.session.table import loads_of
@@ -34,8 +34,6 @@ _MISFIT = Remedy(
     "and compare both results with visioncal diff."
 )
 _WEIGH = Remedy("Weigh the loads, and correct payload_kg and its centre in views.csv.")
-# Prior of a compliance of which nothing is known: a gear of 10 kN m/rad [rad/(N m)].
-_SOFTEST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +169,7 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
             covariance = covariance + np.diag(wider)
     else:
         jacobian = np.concatenate([jacobian, bends], axis=2)
-        covariance = block_diag(covariance, np.eye(count) * _SOFTEST**2)
+        covariance = block_diag(covariance, np.eye(count) * SOFT**2)
         springs, unit = slice(len(covariance) - count, None), 1.0
     rows = jacobian[:, seen.axes].reshape(-1, len(covariance))
     innovation = seen.noise + rows @ covariance @ rows.T

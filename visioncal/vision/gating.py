@@ -11,12 +11,12 @@ from visioncal.vision.poses import determines_pose
 
 # Views differ in noise by a factor of two or so: eight sigma of all are four of the noisiest. A
 # wrong corner is off by a good part of a square.
-_CORNER_SIGMAS = 8.0
+CORNER_SIGMAS = 8.0
 # Views differ in blur and distance, so that their noise differs by two or three; a view with a
 # wrong layout, a moving board or another board is off by far more.
-_VIEW_RATIO = 5.0
+VIEW_RATIO = 5.0
 # Least rejection limits [px]: smaller errors do no harm.
-_CORNER_FLOOR_PX, _VIEW_FLOOR_PX = 0.5, 1.0
+CORNER_FLOOR_PX, VIEW_FLOOR_PX = 0.5, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
     # Median of the length of a two-dimensional Gaussian: sqrt(2 ln 2) sigma (Rayleigh).
     length = np.linalg.norm(residuals, axis=1)
     sigma = np.median(length) / np.sqrt(2 * np.log(2))
-    passes = length <= max(_CORNER_SIGMAS * sigma, _CORNER_FLOOR_PX)
+    passes = length <= max(CORNER_SIGMAS * sigma, CORNER_FLOOR_PX)
 
     rms = np.sqrt(mean_square_by_view(stack, residuals))
-    limit = max(_VIEW_RATIO * float(np.median(rms)), _VIEW_FLOOR_PX)
+    limit = max(VIEW_RATIO * float(np.median(rms)), VIEW_FLOOR_PX)
     kept = stack.sum_by_view(passes.astype(float))
     # A view's rms without its wrong corners, which do not make the view wrong.
     inner = np.sqrt(mean_square_by_view(stack, residuals * passes[:, None]))

@@ -14,7 +14,7 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag, TwoSlopes
 from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
-from visioncal.robot.elasticity import weight_words
+from visioncal.robot.elasticity import SOFT, weight_words
 from visioncal.robot.errors import ArmErrors
 from visioncal.robot.loads import load_ranges
 
@@ -68,8 +68,6 @@ def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult |
     )
 
 
-# Prior of a joint's bend by a load beyond that as stated: a gear of 10 kN m/rad [rad/(N m)].
-_SOFT = 1e-4
 # Loads from which on gears are tried for two slopes [N], torques among which their knees are, as
 # quantiles, and the least square of a second slope's change over its variance: chance leaves 10 in
 # one of a hundred arms, whose six joints each have seven knees.
@@ -164,14 +162,14 @@ def _payload_factor(arm: ArmData) -> Factor | None:
     bent, robot, count = model.bent(arm.q, loads), model.robot, len(model.compliance)
     load_torques = robot.load_torques(bent, loads) - robot.load_torques(bent)
     flange_jacobian = np.zeros((len(reported), 6, count))
-    flange_jacobian[arm.stops] = _SOFT * robot.axis_jacobian(bent) * load_torques[:, None]
+    flange_jacobian[arm.stops] = SOFT * robot.axis_jacobian(bent) * load_torques[:, None]
     flanges, prior = {arm.robot: flange_jacobian}, PriorInformation(np.eye(count), np.zeros(count))
     widened = arm.fit.with_columns(Effect.free("payload", prior, flange_jacobian=flanges))
     covariance, (_, gradient) = widened.absorbed, widened.equations
     columns = np.append(arm.columns[model.columns_of(COMPLIANCE)], np.arange(-count, 0))
-    units = np.repeat([model.weights[COMPLIANCE] / model.torque_nm / _SOFT, 1.0], count)
+    units = np.repeat([model.weights[COMPLIANCE] / model.torque_nm / SOFT, 1.0], count)
     found = -units * (covariance @ gradient)[columns]
-    found[:count] += model.compliance / _SOFT
+    found[:count] += model.compliance / SOFT
     information = np.linalg.inv(np.outer(units, units) * covariance[np.ix_(columns, columns)])
     compliance, by_load = np.split(found, 2)
     values = np.append(compliance, compliance @ by_load / (compliance @ compliance))

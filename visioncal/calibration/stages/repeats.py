@@ -17,13 +17,10 @@ from visioncal.core.types import Corners, FloatArray
 from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
-from visioncal.session.observations import APART_DEG, APART_MM, APART_RAD
+from visioncal.session.observations import APART_DEG, APART_MM, APART_PX, APART_RAD
 
 T = TypeVar("T", bound=Observed)
 
-# Corners of two exposures of one scene differ by the camera's noise in some corner, by more than
-# this [px]; a picture that was stored anew in another file does not.
-_APART_PX = 0.01
 # Numbers of a pose (3, 4) by which rows of one stop may differ [rad, m].
 _UNITS = np.array([np.deg2rad(APART_DEG)] * 3 + [1e-3 * APART_MM])
 # Images of one stop that are enough for a mean.
@@ -156,7 +153,7 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
         ]
         reading = np.concatenate(measured)
         if found is not None:
-            reading = found.px.ravel() / _APART_PX
+            reading = found.px.ravel() / APART_PX
         elif not len(reading) and view.reading_m is not None:
             reading = view.reading_m * (1e3 / APART_MM)
         if not len(reading):

@@ -90,7 +90,7 @@ def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray],
     between = np.linalg.norm(places[:, first] - places[:, second], axis=2)
     best = axes[int(np.argmax(between.min(axis=1, initial=np.inf)))]
     low, high = (points @ best.T).min(axis=0), (points @ best.T).max(axis=0)
-    # What remains free at the borders [px].
+    # Room that remains free at the borders [px].
     room = np.array([WIDTH, _HEIGHT]) - 2.0 * 36.0
     scale = float(np.min(room / np.maximum(high - low, 1e-9)))
     middle = 0.5 * np.array([WIDTH, _HEIGHT]) - scale * 0.5 * (low + high)

@@ -12,7 +12,8 @@ from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import blur_at_corners, shrunk
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.prints import Print
-from visioncal.vision.boards.template import MIN_CORNERS, Refined, refine
+from visioncal.vision.boards.template import Refined, refine
+from visioncal.vision.poses import FEWEST_CORNERS
 
 # Corners that the template does not fit are dropped, as detectors err there by up to a pixel. If
 # too few fit, all corners of the detector are used, with a tenth of the weight: their accuracy
@@ -70,7 +71,7 @@ class Board(BoardKind):
         """Whether these are all corners that the (h, w) image shows, of a board that it may cut."""
         board = self.corners(target)[:, :2]
         missing = np.delete(np.arange(len(board)), seen.ids)
-        if not missing.size or len(seen.ids) < max(MIN_CORNERS, len(missing)):
+        if not missing.size or len(seen.ids) < max(FEWEST_CORNERS, len(missing)):
             return not missing.size
         px_from_board = np.asarray(cv2.findHomography(board[seen.ids], seen.px)[0], float)
         if px_from_board.shape != (3, 3):

@@ -25,7 +25,8 @@ from visioncal.vision.boards.kind import (
     size_of,
 )
 from visioncal.vision.boards.prints import Print
-from visioncal.vision.boards.template import MIN_CORNERS, Refined
+from visioncal.vision.boards.template import Refined
+from visioncal.vision.poses import FEWEST_CORNERS
 
 # Largest diameter over spacing of circles, so that their edges remain separate; that of those named
 # without being declared; that of requested ones, as much dark as white between them.
@@ -143,7 +144,7 @@ class CircleGrid(Board):
 
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
         """Refines (n, 2) detected centres [px] with these (n,) ids by the template."""
-        if len(px) >= MIN_CORNERS:
+        if len(px) >= FEWEST_CORNERS:
             places = self.corners(target)[ids]
             scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(
                 places - places.mean(axis=0)

@@ -50,9 +50,8 @@ from visioncal.core.types import FloatArray, Image, Mask, chosen_rows
 from visioncal.vision.boards.maps import OpticalAxis
 from visioncal.vision.boards.prints import Print, circle, crossing
 from visioncal.vision.boards.windows import SMOOTH_PX, GaussNewtonStep, Windows, smoothing
+from visioncal.vision.poses import FEWEST_CORNERS
 
-# Minimum number of corners for a homography.
-MIN_CORNERS = 4
 # Margin around the outermost corners [px].
 _RIM_PX = 32
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
@@ -160,7 +159,7 @@ def refine(image: Image, pattern: Print, board: FloatArray, px: FloatArray) -> R
     # Failed corners may cause any numerical error; they are rejected afterwards.
     lock = _ONE_IMAGE if len(px) <= _FEW else nullcontext()
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"), lock:
-        if len(px) >= MIN_CORNERS and spans_plane and part.size:
+        if len(px) >= FEWEST_CORNERS and spans_plane and part.size:
             refined = _refine_corners(part, pattern, board, px - low, axis)
             return replace(refined, px=refined.px + low)
     return unrefined(px)
@@ -339,7 +338,10 @@ def _steps(
         columns += [(1 - product / 4) * array for array in (x, y)]
         # The corners of a single tag do not determine how lens distortion bends its sides: these
         # may bend from 115 px on; on shorter ones noise exceeds the bending.
-        if windows.neighbours.shape[1] == MIN_CORNERS and np.median(windows.widths) * 115.0 < 1.0:
+        if (
+            windows.neighbours.shape[1] == FEWEST_CORNERS
+            and np.median(windows.widths) * 115.0 < 1.0
+        ):
             columns += [y * derivatives[0], x * derivatives[1]]
     unknowns = len(columns) + 1
     for slopes in lights:

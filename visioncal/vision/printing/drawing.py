@@ -15,12 +15,13 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D, Transform
 
+from visioncal.core.choices import UNITS_M
 from visioncal.core.threads import DRAWING
 from visioncal.core.types import FloatArray
 from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import FONT_PT, LINE_MM, Sheet
 
-_MM_PER_INCH = 25.4
+_MM_PER_INCH = 1e3 * UNITS_M["inch"]
 _PT_PER_MM = 72.0 / _MM_PER_INCH
 _FONT = "DejaVu Sans"
 _GREY = "#444444"
