@@ -18,8 +18,8 @@ from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.robot_likelihood import RobotLikelihood
 from visioncal.robot.errors import SIGNIFICANT, ArmErrors
 
-# Smaller sizes count as zero, and larger ones are none of links [rad].
-_NOTHING, _MOST = 1e-6, 1.0
+# Smaller sizes count as zero [rad].
+_NOTHING = 1e-6
 # Sizes of the errors of links [rad], and their prior: with a probability of a half log-normal about
 # 0.2 mrad and 0.1 mm a link within a factor of e, by which an arm of a metre is off by some tenths
 # of a millimetre.
@@ -58,7 +58,8 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
     )
     gain = 2.0 * (likelihood.white[1] - value)
     # Beyond the reach of their linear columns, the gain is that of a matrix without a determinant.
-    if gain > SIGNIFICANT and sigmas[-1] < _MOST:
+    # Larger sizes are none of links [rad].
+    if gain > SIGNIFICANT and sigmas[-1] < 1.0:
         # Each parameter costs one in log-likelihood (Akaike 1974).
         sigma = np.sqrt(expit(0.5 * gain - 1.0)) * sigmas[-1]
     else:

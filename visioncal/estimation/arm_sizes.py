@@ -50,12 +50,6 @@ _TYPICAL = {
     _SECOND: 1e-4,
     HARMONICS: 2e-4,
 }
-# Least twice gain by functions with all other sizes held: those that are just significant have half
-# of that or more. Least gain in log-likelihood of a step.
-_LEAST_GAIN, _LITTLE = 5.0, 1e-2
-# Least ratio of data to prior information of combinations that are unknowns; others keep their
-# prior.
-_INFORMATIVE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +120,9 @@ def estimate_arm_sizes(
         _, gain = plain.likelihood.model.likely_size(
             found, blocks.columns(HARMONICS), plain.robot_units
         )
-        if 2.0 * gain > _LEAST_GAIN:
+        # Least twice gain by functions with all other sizes held: those that are just significant
+        # have half of that or more.
+        if 2.0 * gain > 5.0:
             logs = np.append(best.logs[: len(found.logs)], np.log(_TYPICAL[HARMONICS]))
             tried = blocks.most_likely(logs)
         if tried is not None and tried.value < best.value:
@@ -224,7 +220,8 @@ class _Blocks:
     def most_likely(self, start: FloatArray) -> MixedEstimate:
         """Maximum-likelihood levels and sizes, from (2 r + g,) logarithms."""
         low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
-        return self.likelihood.model.maximised(start, low, high, _LITTLE)
+        # Least gain in log-likelihood of a step.
+        return self.likelihood.model.maximised(start, low, high, 1e-2)
 
     def without(self, name: str, logs: FloatArray) -> tuple[Self, FloatArray]:
         """The model without a block, and the logarithms of the other sizes."""
@@ -290,7 +287,9 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
     jacobian = np.concatenate([share * arm.columns(_SECOND), arm.columns(HARMONICS)], axis=2)
     scaled = jacobian * block.sigma
     values, vectors = np.linalg.eigh(gram(scaled, weights @ scaled))
-    determined = vectors[:, values > _INFORMATIVE]
+    # Least ratio of data to prior information of combinations that are unknowns; others keep their
+    # prior.
+    determined = vectors[:, values > 0.05]
     basis = np.concatenate([share * second.basis, block.basis], axis=2)
     errors[HARMONICS] = replace(block, basis=basis @ determined)
     joints, orders = waves.expanded.shape[:2]

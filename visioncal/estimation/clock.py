@@ -43,12 +43,8 @@ from visioncal.vision.corners import floored_sigma_px
 
 # Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0
-# Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
-# test.
-_STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# Ratio of residual noise, rotations times positions, up to which fits are equally good; share to
-# which a change of the offset must reduce it.
-_ALIKE, _CLEARLY_LESS = 1.2, 0.9
+# Fewest stretches for a test.
+_FEWEST_STRETCHES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +182,8 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
 
     Then it is the one near the stated offset; None where none is, or there are no fits.
     """
-    rivals = [fit for fit in fits if fit.residual <= _ALIKE * fits[0].residual]
+    # Ratio of residual noise, rotations times positions, up to which fits are equally good.
+    rivals = [fit for fit in fits if fit.residual <= 1.2 * fits[0].residual]
     if any(abs(fit.offset_s - fits[0].offset_s) > NEAR_S for fit in rivals):
         about_s = np.inf if stated_s is None else stated_s
         rivals = [fit for fit in rivals if abs(fit.offset_s - about_s) <= NEAR_S]
@@ -207,7 +204,8 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
     for _ in range(3):
         corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
         fits = fit_offset(robot, corrected, [fit.offset_s])
-        if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
+        # Share to which a change of the offset must reduce the residual noise.
+        if not fits or fits[0].residual > 0.9 * fit.residual:
             return None
         if frames.stack is not None:
             # A rolling shutter follows the motion, and would be taken for the clock's change.
@@ -270,7 +268,8 @@ def _own_offsets(
 def _stretches(times_s: FloatArray) -> IntArray:
     """(m,) number of the stretch of time that each belongs to, from 0."""
     first_s = times_s.min(initial=np.inf)
-    return np.unique((times_s - first_s) // _STRETCH_S, return_inverse=True)[1]
+    # Length of a stretch of time within which errors may be correlated [s].
+    return np.unique((times_s - first_s) // 1.0, return_inverse=True)[1]
 
 
 def _fit_slope(

@@ -17,10 +17,10 @@ from visioncal.vision.corners import CornerStack
 WIDEST_OFFSET_S = 5.0
 # Least time over which angles are compared, and the search's step [s].
 WINDOW_S, _STEP_S = 0.2, 0.01
-# Peaks within this share of the best are rivals; least distance of distinct peaks [s].
-_RIVAL_SHARE, NEAR_S = 0.9, 0.1
-# Most rivals; fewest and most frames, or pairs of them.
-_MOST_RIVALS, FEWEST_FRAMES, MOST_FRAMES = 12, 4, 600
+# Least distance of distinct peaks [s].
+NEAR_S = 0.1
+# Fewest and most frames, or pairs of them.
+FEWEST_FRAMES, MOST_FRAMES = 4, 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +122,8 @@ def _peaks(scores: FloatArray) -> list[int]:
     if best <= 0.0:
         return []
     padded, apart = np.pad(scores, 1, constant_values=-1.0), int(NEAR_S / _STEP_S)
-    peaks = find_peaks(padded, height=_RIVAL_SHARE * best, distance=apart)[0] - 1
+    # Peaks within this share of the best are rivals.
+    peaks = find_peaks(padded, height=0.9 * best, distance=apart)[0] - 1
     order: list[int] = peaks[np.argsort(-scores[peaks])].tolist()
-    return order[:_MOST_RIVALS]
+    # Most rivals.
+    return order[:12]

@@ -32,10 +32,6 @@ from visioncal.core.types import FloatArray, IntArray
 _GROUP = 100
 # Scalar products of the quaternions from which pairs count in full: up to 165 degrees.
 _FULL_WEIGHT = float(np.cos(np.radians(82.5)) ** 2)
-# Least rotation (root mean square) about a direction that determines a translation: less is the
-# robot's noise of up to 0.5 mrad, and useful motion begins at 10 mrad. Less than the second is
-# rounding [rad^2].
-_SMALLEST_TURN_RAD, _ROUNDING = 2e-3, 1e-14
 # The identity and the half turns about x, y, z.
 _FRAMES = np.array([np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], float)
 
@@ -157,7 +153,8 @@ def tsai(robot: FloatArray, camera: FloatArray) -> FloatArray:
     frame: FloatArray = _FRAMES[np.linalg.eigvalsh(normal_equations(_FRAMES)[0])[:, 0].argmax()]
     for _ in range(2):
         normal, right = normal_equations(frame)
-        rodrigues = _smallest_solution(normal, right, _ROUNDING * pairs.weight.size)
+        # Less is rounding [rad^2].
+        rodrigues = _smallest_solution(normal, right, 1e-14 * pairs.weight.size)
         frame = _rotation(np.array([1.0, *rodrigues])) @ frame
     return frame
 
@@ -414,7 +411,9 @@ def complete(
     mean_turn, mean_position = turns.mean(axis=-3), positions.mean(axis=-3)
     deviations = (turns - mean_turn[..., None, :, :]).reshape(*sets, 3 * m, 3)
     scatter = (positions - mean_position[..., None, :, :]).reshape(*sets, 3 * m, 2)
-    cut, transposed = m * _SMALLEST_TURN_RAD**2, np.swapaxes(deviations, -1, -2)
+    # Least rotation (root mean square) about a direction that determines a translation: less is the
+    # robot's noise of up to 0.5 mrad, and useful motion begins at 10 mrad.
+    cut, transposed = m * 2e-3**2, np.swapaxes(deviations, -1, -2)
     shifts = -_smallest_solution(transposed @ deviations, transposed @ scatter, cut)
     # The step from 0 to 1 that makes column 0 + step * column 1 of the residuals least.
     origin, change = np.moveaxis(scatter + deviations @ shifts, -1, 0)

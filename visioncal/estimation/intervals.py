@@ -13,11 +13,6 @@ from visioncal.estimation.robot_likelihood import robot_likelihood
 # Logarithms of the integration's ends, from a hundredth, below which levels add nothing to a
 # variance, to nine; and the number of steps between, short ones near the most likely level.
 _ENDS, _STEPS = (-4.6, 2.2), 25
-# Levels under a tenth of a micrometre or microradian count as zero. They are then integrated about
-# this one: arms repeat to some hundredths of a millimetre [m].
-_NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
-# Gain in log-likelihood of the other levels after which an interval's end moves by less than 1 %.
-_CONVERGED = 1e-3
 
 
 def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
@@ -40,10 +35,12 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
         rotation, translation = noise.robots[robot]
         ratio, middle, width = translation / rotation, float(translation), 1.0
         at, levels = np.log(np.maximum(noise.robots, LEAST_SIGMA)).ravel(), 2 * robot + np.arange(2)
-        if min(rotation, translation) < _NOTHING:
+        # Levels under a tenth of a micrometre or microradian count as zero. They are then
+        # integrated about this one: arms repeat to some hundredths of a millimetre [m].
+        if min(rotation, translation) < 1e-7:
             factor = np.exp(RATIO_LOG_SIGMA)
             ratio = np.clip(ratio, TYPICAL_RATIO / factor, TYPICAL_RATIO * factor)
-            middle = max(middle, _LEAST_MIDDLE_M)
+            middle = max(middle, 5e-5)
             at[levels] = np.log([middle / ratio, middle])
         else:
             curvature = likelihood.model.at(at).curvature[np.ix_(levels, levels)]
@@ -75,7 +72,9 @@ def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
     def profile(level: int, logarithm: float) -> float:
         at, others = sigmas.copy(), np.arange(len(sigmas)) != level
         at[level] = np.exp(logarithm)
-        return likelihood.most_likely(at.reshape(noise.robots.shape), others, little=_CONVERGED)[1]
+        # Gain in log-likelihood of the other levels after which an interval's end moves by less
+        # than 1 %.
+        return likelihood.most_likely(at.reshape(noise.robots.shape), others, little=1e-3)[1]
 
     intervals = [
         profile_interval(partial(profile, level), sigma, lowest)

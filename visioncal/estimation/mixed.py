@@ -33,13 +33,12 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 TYPICAL_RATIO, RATIO_LOG_SIGMA = 0.6, 1.5
 # Bounds of the standard deviations, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
-# Most change of a size's logarithm in one step, most steps, and least curvature, over that of each
-# size alone.
-_LONGEST_STEP, _STEPS, _FLAT = 1.5, 60, 0.1
+# Most change of a size's logarithm in one step.
+_LONGEST_STEP = 1.5
 # A smaller gain of log-likelihood corresponds to a hundredth of the levels' uncertainty.
 LITTLE = 2e-5
-# First and largest half width and tolerance of its search, in logarithms of the sigma.
-_FIRST_WIDTH, _WIDEST, _EXACT = 0.125, 4.0, 0.02
+# Largest half width of the search of a crossing, in logarithms of the sigma.
+_WIDEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +280,8 @@ def maximised(
         The estimate, and how many likelihoods it took.
     """
     found, count, damping = at(np.clip(start, low, high)), 1, 0.0
-    for _ in range(_STEPS):
+    # Most steps.
+    for _ in range(60):
         # Sizes at a bound that they would cross are held there.
         inside = (high > low) & ~((found.logs <= low) & (found.gradient > 0.0))
         inside &= ~((found.logs >= high) & (found.gradient < 0.0))
@@ -309,8 +309,9 @@ def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatAr
     curvature = found.curvature[inside[:, None], inside]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-8))
     values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
-    # Beside a direction that is steeper by far, one that is flat would be rounding.
-    flat = max(_FLAT, ROUNDING * float(values.max(initial=0.0)))
+    # Beside a direction that is steeper by far, one that is flat would be rounding. Least
+    # curvature, over that of each size alone.
+    flat = max(0.1, ROUNDING * float(values.max(initial=0.0)))
     curvature = (vectors * (np.maximum(values, flat) + damping)) @ vectors.T
     slope = scale * slope
     promised = 0.5 * float(slope @ np.linalg.solve(curvature, slope))
@@ -341,7 +342,7 @@ def profile_interval(
         lowest = local
 
     def crossing(side: float, limit: float) -> float:
-        inner, outer, width = (0.0, 0.0), None, _FIRST_WIDTH
+        inner, outer, width = (0.0, 0.0), None, 0.125
         while True:
             # The root is about linear in the width; between two widths that enclose it.
             root = float(np.sqrt(max(2.0 * (profile(middle + side * width) - lowest), 0.0)))
@@ -356,7 +357,8 @@ def profile_interval(
                 return limit
             else:
                 following = min(width * min(1.1 * SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
-            if not abs(following - width) >= _EXACT:
+            # Tolerance of the half width, in logarithms of the sigma.
+            if not abs(following - width) >= 0.02:
                 return float(np.exp(middle + side * following))
             width = following
 

@@ -20,14 +20,8 @@ from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, by_noise_alone
 from visioncal.session.tree import Branch
 
-# Least share of the following observations explained; others may have moved, too, or be wrong.
-_LEAST_SHARE = 0.25
-# Number of observations whose implied change is tried as a candidate.
-_CANDIDATES = 24
 # Name of the effect of a frame that creeps, before its owner's.
 CREEP = "creep"
-# Share of the session that two observations lie apart at least, whose difference shows a speed.
-_APART = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +158,9 @@ def find_creep(
     left, groups = -_progress(part.observations.stops, problem), [at.rows for at in part.groups]
     speeds = list[FloatArray]()
     for group in groups:
-        first, second = np.nonzero(left[group][:, None] - left[group] > _APART)
+        # Share of the session that two observations lie apart at least, whose difference shows a
+        # speed.
+        first, second = np.nonzero(left[group][:, None] - left[group] > 0.25)
         between = log(invert(changes[group[second]]) @ changes[group[first]])
         speeds.append(between / (left[group[first]] - left[group[second]])[:, None])
     speed = np.median(np.concatenate(speeds), axis=0) if sum(map(len, speeds)) else np.zeros(6)
@@ -253,7 +249,8 @@ def _best_move(
     changes, covariance = (of_rows[order] for of_rows in _implied_changes(part, fit, frame))
     stops, explained = part.observations.stops[order], agrees[rows][order]
     outliers = np.flatnonzero(~explained)
-    tried = outliers[np.linspace(0, len(outliers) - 1, min(_CANDIDATES, len(outliers))).astype(int)]
+    # Number of observations whose implied change is tried as a candidate.
+    tried = outliers[np.linspace(0, len(outliers) - 1, min(24, len(outliers))).astype(int)]
     differences = log(invert(changes[tried])[:, None] @ changes[None])
     covariances = covariance[tried][:, None] + covariance[None]
     squares = np.einsum(
@@ -267,11 +264,12 @@ def _best_move(
     begin = int(first[index])
     after = agreeing[candidate] & (stops >= stops[begin])
     gain = int(gains[candidate, begin])
+    # Least share of the following observations explained; others may have moved, too, or be wrong.
     if (
         gain < FEWEST_VIEWS
         or len(np.unique(stops[after])) < FEWEST_VIEWS
         or len(np.unique(stops[explained & (stops < stops[begin])])) < FEWEST_VIEWS
-        or after.sum() <= _LEAST_SHARE * (len(stops) - begin)
+        or after.sum() <= 0.25 * (len(stops) - begin)
     ):
         return []
     # The mean over all observations that agree with this step.

@@ -18,15 +18,9 @@ from visioncal.estimation.parameters import Parameter
 
 # Relative sizes of the other errors of a parameter's blocks that are tried.
 _RESTS = np.geomspace(0.05, 1.0, 9)
-# Prior sigma of a parameter that was mistyped [rad]: 3 mm, 0.3 deg, 0.6 % of a gear.
-_MISTYPED_RAD = 6e-3
 # Log odds against the errors that all arms have, of one parameter of some forty; and within which
 # another one is as likely.
 _CLEAR, _AS_LIKELY = float(np.log(40.0 * 1000.0)), float(np.log(20.0))
-# Least share of a parameter in a block whose other errors are then smaller.
-_OF_BLOCK = 0.1
-# Ordinary arms leave less [rad]: 1 mm, 0.1 deg, 0.1 % of a gear.
-_ORDINARY_RAD, _ORDINARY_RATIO, _SIGMAS = 2e-3, 1e-3, 5.0
 
 
 @dataclass(frozen=True)
@@ -66,12 +60,14 @@ def far_parameters(
         blocks = map(arm.model.columns_of, arm.model.weights)
         in_blocks, whole = np.zeros(len(columns), dtype=bool), np.sum(direction**2)
         for block in blocks:
-            in_blocks[block] = np.sum(direction[block] ** 2) > _OF_BLOCK * whole
+            # Least share of a parameter in a block whose other errors are then smaller.
+            in_blocks[block] = np.sum(direction[block] ** 2) > 0.1 * whole
         # Parameters of one kind share their blocks.
         if (key := in_blocks.tobytes()) not in rests_of:
             sizes = (np.where(in_blocks, rest, 1.0) for rest in _RESTS.tolist())
             rests_of[key] = [_Rest(information, seen, each) for each in sizes]
-        prior = _MISTYPED_RAD * parameters[at].unit / size
+        # Prior sigma of a parameter that was mistyped [rad]: 3 mm, 0.3 deg, 0.6 % of a gear.
+        prior = 6e-3 * parameters[at].unit / size
         fits = []
         for rest, errors in zip(_RESTS.tolist(), rests_of[key], strict=True):
             gain, change, sigma = errors.with_free(direction, prior)
@@ -86,8 +82,9 @@ def far_parameters(
 def _is_far(found: FarParameter, parameters: Sequence[Parameter]) -> bool:
     """Whether a parameter is off by more than makers leave, and nearly alone."""
     parameter = parameters[found.at]
-    usual = _ORDINARY_RATIO if parameter.kind == "ratio" else _ORDINARY_RAD * parameter.unit
-    return abs(found.change) > max(usual, _SIGMAS * found.sigma) and 2.0 * found.rest < 1.0
+    # Ordinary arms leave less [rad]: 1 mm, 0.1 deg, 0.1 % of a gear.
+    usual = 1e-3 if parameter.kind == "ratio" else 2e-3 * parameter.unit
+    return abs(found.change) > max(usual, 5.0 * found.sigma) and 2.0 * found.rest < 1.0
 
 
 class _Rest:

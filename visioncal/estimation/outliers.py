@@ -50,15 +50,8 @@ EARLY_SHARE = 0.4
 _MOST_MOVES = 8
 # Limit of an observation's distance from its prediction: in metres, and over the median.
 _NEAR_M, _FAR = 0.04, 6.0
-# Multiple of the median distance beyond which an observation is an outlier even without a
-# consensus.
-_GROSS = 20.0
 # Largest noise of robots: larger errors are outliers [rad, m].
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
-# Least share of inliers; with fewer, the outliers cannot be identified.
-_LEAST_SHARE = 0.5
-# Least share that agrees but for noise larger than robots have, where others are gross outliers.
-_MOST_AGREE = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,18 +221,23 @@ def find_inliers(
         )
         found = _converged(problem, *_refined(problem, mask, fit), ())
         is_noise = bool(np.all(found.fit.noise.robots < _MOST_NOISE))
-        if found.used.sum() >= max(_LEAST_SHARE * len(problem), FEWEST_COMPARED) and is_noise:
+        # Least share of inliers; with fewer, the outliers cannot be identified.
+        if found.used.sum() >= max(0.5 * len(problem), FEWEST_COMPARED) and is_noise:
             return found
         fit, near = found.fit, _near(problem, found.fit.state, all_rows)
         for _ in range(ROUNDS):
-            if near.sum() < max(_MOST_AGREE * len(problem), FEWEST_COMPARED) or near.all():
+            # Least share that agrees but for noise larger than robots have, where others are gross
+            # outliers.
+            if near.sum() < max(0.75 * len(problem), FEWEST_COMPARED) or near.all():
                 break
             before, fit = near, fit_problem(problem.subset(near), fit.state)
             near = _near(problem, fit.state, before)
             if np.array_equal(near, before):
                 return _inlier_fit(problem, near, fit, ())
     fit = fit_problem(problem, state)
-    near = _near(problem, fit.state, all_rows, _GROSS)
+    # Multiple of the median distance beyond which an observation is an outlier even without a
+    # consensus.
+    near = _near(problem, fit.state, all_rows, 20.0)
     if not FEWEST_COMPARED <= near.sum() < len(problem):
         return _inlier_fit(problem, all_rows, fit, ())
     return _inlier_fit(problem, near, fit_problem(problem.subset(near), fit.state), ())

@@ -16,11 +16,6 @@ from visioncal.vision.targets import numbered_positions
 
 # Frame of a single camera.
 ONLY_CAMERA = "cam"
-# Share of the information of values that is added where they have none.
-_RIDGE = 1e-12
-# Prior sigmas of intrinsics that are given to be refined: focal length and centre as shares of the
-# focal length, and distortion coefficients.
-_FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +179,9 @@ class CornerProblem:
         prior = floored_sigma_px(sigma_px) ** 2 * self.prior_information[np.ix_(kept, kept)]
         found = compressed.coefficients
         freedom = 0.0 if found is None else found.freedom
-        # Values that nothing determines are none.
-        ridge = _RIDGE * np.diag(np.diag(information) + 1.0)
+        # Values that nothing determines are none. Share of the information of values that is added
+        # where they have none.
+        ridge = 1e-12 * np.diag(np.diag(information) + 1.0)
         effective = float(np.trace(np.linalg.solve(information + prior + ridge, information)))
         return 6 * len(compressed.information) + round(effective + freedom)
 
@@ -201,6 +197,8 @@ def _lens_sigma(scene: Scene, *, is_refined: bool) -> FloatArray:
         return np.full(4 + count, np.inf)
     matrix, distortion = scene.matrix_sigma_px or 0.0, 0.0
     if is_refined:
-        matrix = scene.matrix_sigma_px or _FOCAL_SHARE * float(scene.camera.matrix[:2].max())
-        distortion = _DISTORTION_SIGMA
+        # Prior sigmas of intrinsics that are given to be refined: focal length and centre as shares
+        # of the focal length, and distortion coefficients.
+        matrix = scene.matrix_sigma_px or 0.05 * float(scene.camera.matrix[:2].max())
+        distortion = 0.3
     return np.repeat([matrix, distortion], [4, count])

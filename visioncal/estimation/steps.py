@@ -42,8 +42,6 @@ _PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
     JOINT: ((1e-4, 1e-3, 1e-2, 1e-1), np.ones(1)),
     SIZE: ((1e-3, 1e-2, 1e-1), np.ones(1)),
 }
-# Observations among which a common step is sought: of more, all would take memory by their square.
-_CANDIDATES = 200
 # Largest share of the residuals that a change explains.
 _MOST_EXPLAINED = 0.99
 
@@ -375,7 +373,9 @@ def step_of(
     if part.observations.has_rotation.all():
         changes = part.change_of(frame, state)
         if step is None:
-            some = changes[evenly(len(changes), _CANDIDATES)]
+            # Observations among which a common step is sought: of more, all would take memory by
+            # their square.
+            some = changes[evenly(len(changes), 200)]
             apart = np.linalg.norm(log(invert(some)[:, None] @ changes) / TWIST_UNITS, axis=-1)
             nearest = apart[int(np.median(apart, axis=1).argmin())]
             # One wrong pose among few would put their mean off.

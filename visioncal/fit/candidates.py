@@ -52,14 +52,10 @@ from visioncal.vision.targets import corner_positions
 _RULED_OUT = float(np.log(CheckLimits.ruled_out))
 # Most stops after which a frame may have been moved, and a lens.
 _STEPS, _ZOOMS = 12, 60
-# Boards that swell are rarer by so much than what creeps.
-_SWELLS = 100.0
 # Most stops at which images may move while they are read, of four unknowns each, and what counts
 # between their first row and their last [px]: below, other errors of images look so; and its size
 # at most, over that which each image shows by itself.
 _MOVING, _LEAST_PX, _SHOWN = 120, 0.1, 3.0
-# Corners of a board that bends with its weight, at least: a tag is too small, and says too little.
-_BENDING = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +196,9 @@ def _sags(fit: Fit, pairs: Sequence[Pair], camera: str) -> Iterator[tuple[BoardS
     for board in boards if len(boards) == 1 else ():
         flange, edges = fit.cell.tree.branches[board].parent, fit.linearised.values
         points = corner_positions(fit.cell.boards[board])
-        if flange in fit.cell.arms and ("edge", board) in edges and len(points) >= _BENDING:
+        # Corners of a board that bends with its weight, at least: a tag is too small, and says too
+        # little.
+        if flange in fit.cell.arms and ("edge", board) in edges and len(points) >= 12:
             yield BoardSags.tried(camera, flange, edges["edge", board][:3, 2], points)
 
 
@@ -277,7 +275,8 @@ def scored(
         # When something was moved is a free choice.
         off = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps | JointsStep) else 0.0
         off += np.log(_ZOOMS) if isinstance(effect, LensSteps) else 0.0
-        off += np.log(_SWELLS) if isinstance(effect, BoardSwells) else 0.0
+        # Boards that swell are rarer by so much than what creeps.
+        off += np.log(100.0) if isinstance(effect, BoardSwells) else 0.0
         member = starting_at(random_effect(effect), size)
         yield Candidate(gain - off, member, effect, explained=explained - off)
 

@@ -23,9 +23,6 @@ from visioncal.core.transforms import (
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 
-# Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
-# probability (1 - 1/8)^40 = 0.5 %.
-_TRIPLES = 40
 # An edge with a larger sigma [m, with rotations on a lever] is no start.
 WORST_M = 0.1
 # Largest mean distance of views that agree, rotations on a lever [m].
@@ -226,9 +223,9 @@ def _drawn(counts: tuple[int, ...]) -> tuple[IntArray, ...]:
     """Triples of views with so many candidates: often those with few, of fewer combinations."""
     rng, weights = np.random.default_rng(0), 1.0 / np.array(counts) ** 2
     shares = weights / weights.sum()
-    return tuple(
-        rng.choice(len(counts), FEWEST_VIEWS, replace=False, p=shares) for _ in range(_TRIPLES)
-    )
+    # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
+    # probability (1 - 1/8)^40 = 0.5 %.
+    return tuple(rng.choice(len(counts), FEWEST_VIEWS, replace=False, p=shares) for _ in range(40))
 
 
 def _triples(candidates: Candidates) -> tuple[IntArray, IntArray]:

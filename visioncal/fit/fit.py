@@ -14,10 +14,6 @@ from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, Moments
 from visioncal.vision.camera import with_intrinsics
 
-# Added to information that determines nothing, over its diagonal.
-_RIDGE = 1e-9
-
-
 # `away`, `predicted` and `measured` of some sightings.
 _Deviation: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -232,6 +228,7 @@ def _sighting_poses(heads: FloatArray) -> tuple[FloatArray, FloatArray]:
     pose = information[:, :, :6]
     scale = np.maximum(np.trace(pose, axis1=1, axis2=2), 1.0)
     diagonal = np.diagonal(pose, axis1=1, axis2=2) + 1e-3 * scale[:, None]
-    covariance = np.linalg.inv(pose + _RIDGE * diagonal[:, :, None] * np.eye(6))
+    # Added to information that determines nothing, over its diagonal.
+    covariance = np.linalg.inv(pose + 1e-9 * diagonal[:, :, None] * np.eye(6))
     other = covariance @ information[:, :, 6:]
     return covariance, np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)

@@ -16,15 +16,13 @@ from visioncal.fit.processes import Considered
 from visioncal.fit.score import Score
 from visioncal.fit.unknowns import Key, Vector, given_lens
 
-# Share of boards whose size is not within what is stated.
-_OTHERS = 0.05
-
 
 def doubted_boards(considered: Iterable[Considered]) -> dict[Key, float]:
     """Mean square of what held boards may be off by beyond what is stated, by their shape's key."""
     squares = dict[Key, float]()
     for one in considered:
-        share = float(expit(one.board_odds + logit(_OTHERS)))
+        # Share of boards whose size is not within what is stated.
+        share = float(expit(one.board_odds + logit(0.05)))
         squares |= {key: share * square for key, square in one.board_squares.items()}
     return squares
 

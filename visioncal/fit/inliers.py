@@ -17,14 +17,6 @@ from visioncal.fit.unknowns import State, Unknowns
 from visioncal.fit.weights import weighed
 from visioncal.model import Cell
 
-# Share of the limit from which sightings are tested again, by noise without them.
-_SUSPECT = 0.4
-# Most linearisations; a step under this share of every sigma is negligible.
-_ROUNDS, _SETTLED = 8, 0.02
-# The rest after a step, over itself and the most that anything turns by it.
-_SECOND = 3.0
-# Change of a size's logarithm from which it is asked again whether chance explains it.
-_MOVED = 0.2
 # Rounds in which sightings come back while the noise is scaled by what most have: the nearest half
 # has less noise than all.
 _SCALED, _WIDENED = 4, 6
@@ -68,7 +60,8 @@ class Search:
         """
         before = used & self.sound
         fit, left_out = self._agreeing(self._sized(state, before, known))
-        for _ in range(_ROUNDS):
+        # Most linearisations.
+        for _ in range(8):
             if np.array_equal(before, fit.used) and _is_settled(fit):
                 break
             before = fit.used
@@ -109,8 +102,9 @@ class Search:
         found = most_likely(mixed, begin, low, high)
         random = {size for size, *_ in unknowns.priors() if size >= 0}
         if is_again:
-            # Of a size that stays as it was, the last linearisation told.
-            moved = np.abs(found.estimate.logs - begin) > _MOVED
+            # Of a size that stays as it was, the last linearisation told. Change of a size's
+            # logarithm from which it is asked again whether chance explains it.
+            moved = np.abs(found.estimate.logs - begin) > 0.2
             is_open = (high > low) & (found.estimate.logs > low)
             random -= set(np.flatnonzero(is_open & ~moved).tolist())
         tested = {at: unknowns.sizes[at] for at in sorted(random)}
@@ -140,7 +134,8 @@ class Search:
                 fit = self._refitted(fit, fit.used | reached)
                 continue
             worst = int(np.argmax(np.where(fit.used, beyond, 0.0)))
-            if beyond[worst] < _SUSPECT or fit.used.sum() <= fewest:
+            # Share of the limit from which sightings are tested again, by noise without them.
+            if beyond[worst] < 0.4 or fit.used.sum() <= fewest:
                 break
             # A sighting that is tested adds to no noise.
             without = self._refitted(fit, fit.used & (np.arange(count) != worst))
@@ -185,7 +180,9 @@ def _is_settled(fit: Fit) -> bool:
         turns.append(effect.curvature * np.abs(steps[kept.columns("effect", effect.name)]))
     most = float(np.concatenate([np.zeros(1), *turns]).max())
     sigmas = np.sqrt(np.diag(fit.estimate.covariance))
-    return bool(np.all(min(_SECOND * most, 1.0) * np.abs(steps) < _SETTLED * sigmas))
+    # A step under this share of every sigma is negligible. The rest after a step, over itself and
+    # the most that anything turns by it.
+    return bool(np.all(min(3.0 * most, 1.0) * np.abs(steps) < 0.02 * sigmas))
 
 
 def nearest(start: Start) -> Mask:

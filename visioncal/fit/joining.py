@@ -33,10 +33,6 @@ from visioncal.fit.consensus import (
 )
 from visioncal.session.tree import PathStep, Tree
 
-# Most orientations of boards that are tried.
-_MOST_TRIED = 256
-
-
 # Rows by which poses may be shifted; a row is wrong from this multiple of the typical distance on;
 # larger distances than this [m] may be those of wrong rows.
 _SHIFTS, _FAR, _NEAR_M = (1, -1, 2, -2, 3, -3), 6.0, 0.002
@@ -223,7 +219,8 @@ class Network:
         joined, relations, by_turn, counts = self._grown(known, ())
         if not by_turn:
             return joined, (), relations
-        while np.prod(counts, dtype=float) > _MOST_TRIED:
+        # Most orientations of boards that are tried.
+        while np.prod(counts, dtype=float) > 256:
             counts[counts.index(max(counts))] = 1
         tried = []
         for choice in product(*map(range, counts)):

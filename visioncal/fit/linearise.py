@@ -32,9 +32,6 @@ from visioncal.model.effects import Displacement, Rolling, RowMotion
 from visioncal.session.tree import PathStep
 from visioncal.vision.camera import project_with_jacobian
 
-# Added to the information about a pose that corners leave open, over its diagonal.
-_SINGULAR = 1e-12
-
 
 @dataclass(frozen=True, eq=False)
 class Products:
@@ -299,7 +296,8 @@ def _corner_parts(unknowns: Unknowns, pair: Pair, rows: "CornerRows") -> tuple[P
 def of_pose_alone(heads: FloatArray) -> FloatArray:
     """(k, 6, 6) inverse information of (k, h, d + 1) products about their poses alone."""
     pose = heads[:, :6, :6]
-    ridge = _SINGULAR * (np.diagonal(pose, axis1=1, axis2=2) + np.ones(6))
+    # Added to the information about a pose that corners leave open, over its diagonal.
+    ridge = 1e-12 * (np.diagonal(pose, axis1=1, axis2=2) + np.ones(6))
     return np.asarray(np.linalg.inv(pose + ridge[:, :, None] * np.eye(6)), dtype=np.float64)
 
 

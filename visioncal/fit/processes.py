@@ -37,12 +37,10 @@ ENOUGH_STOPS, _MOST = 8, 40
 # Sizes of what boards that are not as stated are off by, as shares, and how many of them are: most
 # are prints that were scaled, some are not the described ones.
 _LOOSE = {0.01: 0.9, 0.1: 0.1}
-# Shares of evidence that do not count: of a size, of a process where estimates are averaged.
-_LITTLE, _SHARE = 1e-4, 0.01
+# Share of evidence of a size that does not count.
+_LITTLE = 1e-4
 # Logarithm below the most evidence from which less is not looked for.
 _FAR = 14.0
-# Most stops at which estimates are averaged; of more, the mean over the stops is nearly as good.
-_AVERAGED = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,9 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     moved = list[tuple[float, FloatArray]]()
     for process, weighted in by_process.items():
         share = sum(share for share, _ in weighted)
-        if process.is_of_time and share > _SHARE and stops <= _AVERAGED:
+        # Less evidence of a process does not count. Most stops at which estimates are averaged; of
+        # more, the mean over the stops is nearly as good.
+        if process.is_of_time and share > 0.01 and stops <= 100:
             # The likeliest size of a process stands for all of its sizes where it is estimated.
             values, covariance = _estimated(by_stop, *max(weighted, key=lambda one: one[0])[1])
             moved.append((share, values - fit.estimate.values))

@@ -22,12 +22,8 @@ from visioncal.fit.pairs import Pair, images_of
 from visioncal.model.effects import Displacement, Effect, RowMotion
 from visioncal.vision.camera import project_with_jacobian
 
-# Columns from which on no eigenvectors are worked out.
-_MANY = 64
 # Sizes that are tried, over one that the data would just show.
 _TRIED = np.exp(np.linspace(-3.0, 5.0, 17))
-# Least size of a function of the field, over the uncertainty with which all corners show it.
-_SEEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +49,8 @@ class Score:
         at = np.flatnonzero(sigmas > 1e-3 * sigmas.max(initial=0.0))
         scaled = self.information[at[:, None], at] * np.outer(sigmas[at], sigmas[at])
         pull = (sigmas * self.pull)[at]
-        if len(at) > _MANY:
+        # Columns from which on no eigenvectors are worked out.
+        if len(at) > 64:
             return _best_of_many(scaled, pull, low, high, self._student)
         values, vectors = np.linalg.eigh(scaled)
         sizes = _sizes_of(float(values.max(initial=0.0)), low, high)
@@ -325,8 +322,9 @@ def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, flo
         size, gain = found.best(np.tile(field.sigmas, 2), 1e-4, 5.0)
         options.append((gain, size, field))
     gain, size, field = max(options, key=lambda option: option[0])
-    # Of a function below this, all corners together show nothing.
-    return field.shown(px, _SEEN**2 / (size**2 * weight)), size, gain
+    # Of a function below this, all corners together show nothing. Least size of a function of the
+    # field, over the uncertainty with which all corners show it.
+    return field.shown(px, 0.5**2 / (size**2 * weight)), size, gain
 
 
 def _weight(fit: Fit, gram: Gram, part: int = 0) -> float:

@@ -12,8 +12,6 @@ from visioncal.model.effects.effect import SIGNIFICANT, Size
 
 # Most change of a size's logarithm in one search: in the elimination, far sizes cancel to nothing.
 _FAR = 3.0
-# Gain of -2 log L that is negligible.
-_LITTLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +33,8 @@ def most_likely(mixed: Mixed, start: FloatArray, low: FloatArray, high: FloatArr
     """
     first = np.clip(start, low, high)
     least, most = np.maximum(low, first - _FAR), np.minimum(high, first + _FAR)
-    return Found(*maximised(mixed.at, first, least, most, _LITTLE))
+    # Gain of -2 log L that is negligible.
+    return Found(*maximised(mixed.at, first, least, most, 1e-3))
 
 
 def significant(

@@ -35,15 +35,6 @@ from visioncal.model.boards import SHAPES, shape_count
 from visioncal.model.effects import Clock, Effect, LensSteps, Links, Rolling, Size, Zeros
 from visioncal.vision.camera import intrinsics
 
-# Numbers of corners for each unknown of lenses and boards, below which these are held.
-_SPARE = 10
-# Log-odds of boards of another size that free it.
-_CLEAR = 7.0
-# Errors of links that arms have at most, a joint [rad], [m / 0.5]: two millimetres of all joints.
-_MOST_LINKS = 1e-3
-# Most effects that are opened, one after the other.
-_OPENED = 5
-
 
 @dataclass(frozen=True, eq=False)
 class CellFit:
@@ -80,7 +71,8 @@ def solve_from(start: Start) -> CellFit:
     fit, left_out = search.run(state_of(start, effects), nearest(start))
     refuse_open(fit)
     search, fit, left_out = _explained(search, fit, left_out)
-    for _ in range(_OPENED):
+    # Most effects that are opened, one after the other.
+    for _ in range(5):
         wider = _opened_next(search, fit)
         if wider is None:
             break
@@ -95,7 +87,8 @@ def solve_from(start: Start) -> CellFit:
         search = search.with_unknowns(held)
         fit, left_out = search.run(fit.state, fit.used, fit)
     found = {name: consider(fit, name) for name in fit.unknowns.erring}
-    if any(one is not None and one.board_odds > _CLEAR for one in found.values()):
+    # Log-odds of boards of another size that free it.
+    if any(one is not None and one.board_odds > 7.0 for one in found.values()):
         # Boards of another size, which no error of an arm's posture explains.
         search = search.with_unknowns(with_free_boards(fit))
         fit, left_out = search.run(fit.state, fit.used, fit)
@@ -142,7 +135,9 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
         # With more noise anything agrees, and with links that are far off.
         before, after = _levels(fit), _levels(found)
         is_noise = any(after[name] > 2.0 * level for name, level in before.items())
-        is_noise |= known is None and any(found.sizes[name] > _MOST_LINKS for name in links)
+        # Errors of links that arms have at most, a joint [rad], [m / 0.5]: two millimetres of all
+        # joints.
+        is_noise |= known is None and any(found.sizes[name] > 1e-3 for name in links)
         if not is_noise and (search.sound & ~found.used).sum() < lost / 2:
             if known is not None and _is_moved(search, known, found):
                 continue
@@ -250,7 +245,8 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
     ]
     corners = sum(2 * len(s.corners.ids) - 6 for s in cell.sightings if s.corners is not None)
     sought = sum(len(intrinsics(lens)) + SHAPES for lens in start.lenses.values())
-    has_shape = corners >= _SPARE * sought
+    # Numbers of corners for each unknown of lenses and boards, below which these are held.
+    has_shape = corners >= 10 * sought
     for name, lens in start.lenses.items():
         table = cell.cameras[name]
         if table.stated is None:

@@ -32,12 +32,8 @@ from visioncal.vision.intrinsics import estimate_intrinsics
 from visioncal.vision.poses import closed_form_poses, determines_pose
 from visioncal.vision.targets import corner_positions, first_numbers, rotation_transforms, rotations
 
-# Most images of which a lens is estimated.
-_IMAGES = 40
 # Focal lengths that lenses have, over the width, and how many are tried; ratio of both, less one.
 _FOCAL, _FOCALS, _SQUARE = (0.25, 10.0), 12, 0.05
-# The second pose of a flat board stays where it fits within this factor and addition [px].
-_ALIKE, _ALIKE_PX = 2.0, 0.3
 _NO_POSE = "corners that determine no pose: all, or all but one, lie in one row of the target"
 
 
@@ -197,7 +193,8 @@ def _by_corners(cell: Cell, frame: str, table: CameraTable) -> Camera:
         and determines_pose(corner_positions(cell.boards[s.seen])[s.corners.ids])
     }
     rows = [*corners]
-    corners = {rows[at]: corners[rows[at]] for at in evenly(len(rows), _IMAGES)}
+    # Most images of which a lens is estimated.
+    corners = {rows[at]: corners[rows[at]] for at in evenly(len(rows), 40)}
     most = np.max([np.ones(2), *(at.px.max(axis=0) for at in corners.values())], axis=0)
     size = table.resolution or (int(most[0]) + 1, int(most[1]) + 1)
     try:
@@ -279,7 +276,8 @@ def _of_corners(
     off = np.array([np.sqrt(np.nanmean(each**2)) for each in away])
     if not np.isfinite(off).any():
         return None
-    alike = poses[off < _ALIKE * np.nanmin(off) + _ALIKE_PX]
+    # The second pose of a flat board stays where it fits within this factor and addition [px].
+    alike = poses[off < 2.0 * np.nanmin(off) + 0.3]
     numbers = np.tile(np.arange(len(symmetries)), len(alike))
     return _Options((alike[:, None] @ symmetries).reshape(-1, 4, 4), numbers)
 

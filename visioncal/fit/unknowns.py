@@ -20,9 +20,6 @@ from visioncal.vision.camera import intrinsics, with_intrinsics
 Kind: TypeAlias = Literal["edge", "lens", "shape", "effect", "field"]
 Key: TypeAlias = tuple[Kind, str]
 
-# A maker's lens: its centre is in the middle of the image within this share of the width, and p1
-# and p2 are within this.
-_CENTRE, _TANGENTIAL = 0.02, 1e-3
 # Likelihood ratio from which what is off in one of ten cases is likelier so than not: given lenses,
 # and boards that are not flat.
 _ONE_IN_TEN = 2.0 * float(np.log(9.0))
@@ -267,10 +264,12 @@ def estimated_lens(frame: str, lens: Camera) -> Vector:
     values, width, height = intrinsics(lens), *lens.resolution
     mean = values.copy()
     mean[2:4] = (width - 1) / 2, (height - 1) / 2
-    priors = [Prior(np.array([2, 3]), sigma=_CENTRE * width)]
+    # A maker's lens: its centre is in the middle of the image within this share of the width, and
+    # p1 and p2 are within this.
+    priors = [Prior(np.array([2, 3]), sigma=0.02 * width)]
     if lens.model == "brown":
         mean[6:8] = 0.0
-        priors.append(Prior(np.array([6, 7]), sigma=_TANGENTIAL))
+        priors.append(Prior(np.array([6, 7]), sigma=1e-3))
     return Vector(("lens", frame), tuple(priors), mean, np.ones(len(values)))
 
 
