@@ -13,11 +13,24 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import Stage, run_stages
 from visioncal.calibration.suspects.moved_views import without_tool
 from visioncal.calibration.suspects.pairs_alone import PairAlone, found_alone, of_all_rows
+from visioncal.cli.summary import _not_in_verdict
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp
 from visioncal.core.types import MOUNTS
-from visioncal.core.verdict import Finding, Option, Remedy, Verdict, mending
+from visioncal.core.verdict import (
+    AGAIN,
+    Finding,
+    Option,
+    Remedy,
+    Verdict,
+    again,
+    calibrating,
+    mending,
+    with_paths,
+)
+from visioncal.results import ViewResult
 from visioncal.simulation import NetworkOptions, cell_session, simulate
+from visioncal.verification.misreading import misreading
 
 # Sentences that end where others begin to say what follows from a cause.
 _CAUSE = "The lens changed; its focus is another one. The result counts in pixels."
@@ -102,3 +115,56 @@ def test_an_error_is_explained_by_what_explains_it_not_by_its_message(monkeypatc
     monkeypatch.setattr("visioncal.calibration.run.explained", lambda *_, **__: said["alone"])
     with pytest.raises(DegenerateError, match=r"^Few\. Look\.$"):
         run_stages(state, [Stage("solve", fails)])
+
+
+@pytest.mark.parametrize(
+    ("do", "words", "command"),
+    [
+        (
+            calibrating("Correct the row of the calibrated arm, and"),
+            "Correct the row of the calibrated arm, and verify again.",
+            "visioncal verify SESSION --against OUT",
+        ),
+        (
+            mending("calibrated poses are read so", Option("shift", "2", (3, 4))),
+            "Write a copy of the session in which calibrated poses are read so, and verify it.",
+            "visioncal convert SESSION FIXED --shift 3-4:2 && visioncal verify FIXED --against OUT",
+        ),
+        (Remedy("Look at the calibrated arm."), "Look at the calibrated arm.", ""),
+    ],
+)
+def test_stops_that_are_misread_are_verified_and_no_word_beside_it(monkeypatch, do, words, command):
+    found = Finding("misread_poses", "They are misread.", do)
+    monkeypatch.setattr("visioncal.verification.misreading.misread_poses", lambda _: iter([found]))
+    assert misreading(None).do == Remedy(words, command)
+
+
+def test_paths_are_no_part_of_an_options_value(tmp_path, monkeypatch):
+    """A board may be called as a placeholder is."""
+    monkeypatch.chdir(tmp_path)
+    do = mending("it is larger", Option("board-scale", "NEW:1.01"))
+    assert with_paths(do.command, "a", "out") == (
+        "visioncal convert a a-fixed --board-scale NEW:1.01 && visioncal calibrate a-fixed -o out"
+    )
+    assert with_paths("Look (visioncal show OUT).", "a", "out") == "Look (visioncal show out)."
+
+
+def test_an_option_of_the_typed_command_is_beside_it():
+    do = again("State it.", Option("robot-form", "quaternion"))
+    assert do.command == f"{AGAIN} --robot-form quaternion"
+    assert str(do) == "State it."
+
+
+def test_views_whose_one_reason_a_finding_states_are_not_listed_again():
+    """A reason may be a part of another one."""
+    views = [_left_out(3, "disagrees with the others by 2 mm"), _left_out(4, "disagrees")]
+    words = "Views 3, 4 were left out. View 3 disagrees with the others by 2 mm."
+    found = Finding("wrong_views", words, views=(3, 4), without_it="The rest agrees.")
+    verdict = Verdict("check", (found,))
+    assert [*_not_in_verdict(verdict, views)] == views
+    alike = [_left_out(3, "disagrees"), _left_out(4, "disagrees")]
+    assert not [*_not_in_verdict(verdict, alike)]
+
+
+def _left_out(view: int, reason: str) -> ViewResult:
+    return ViewResult(view, used=False, reason=reason)

@@ -1,6 +1,6 @@
 """Calibrates a session, of one camera and robot or of a whole cell: the whole path, as a page."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,6 @@ from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Corners, Progress, Rejection, Searched
-from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -214,18 +213,15 @@ STAGES: tuple[Stage, ...] = (
 )
 
 
-def misread_poses(state: RunState) -> Iterator[Finding]:
-    """Findings on other readings of a run's poses that explain what its camera sees."""
-    yield from misreadings(state)
+# Findings on other readings of a run's poses that explain what its camera sees.
+misread_poses = misreadings
 
 
 def _explained_by_pairs(error: VisioncalError, state: RunState) -> VisioncalError | None:
     """The error of a whole cell by the first cause that a pair of it shows alone."""
-    every = [] if state.mount is not None else pairs_alone(state, partial(_of_pair, state))
-    for found in found_alone(state, every):
+    for found in found_alone(state, pairs_alone(state, partial(_of_pair, state))):
         culprits = [f"view {view}" for view in found.views] or error.culprits
-        words = found.in_words().words
-        return type(error)(words, culprits=culprits, next_step=str(found.do or ""))
+        return error.but(found.in_words().words, culprits=culprits, next_step=str(found.do or ""))
     return None
 
 

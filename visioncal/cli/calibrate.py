@@ -15,7 +15,7 @@ from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import ranges
-from visioncal.core.verdict import Finding, need_options
+from visioncal.core.verdict import Remedy, need_options
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_calibration
 from visioncal.results.history import entries_of
@@ -82,17 +82,17 @@ def _calibrate_loaded(options: CalibrateOptions, loaded: Session, against: Path)
             next_step="Name another folder with -o: the unloaded one stays for further loads.",
         )
     folder = (against if against.is_dir() else against.parent).absolute()
-    stiff, findings = calibrate_loaded(loaded, load_calibration(against)), list[Finding]()
-    for finding in stiff.verdict.findings:
+    stiff = calibrate_loaded(loaded, load_calibration(against))
+
+    def renamed(do: Remedy) -> Remedy:
         # Steps with the unloaded result are taken with this one.
-        parts = shlex.split(finding.do.command, posix=False) if finding.do is not None else []
+        parts = shlex.split(do.command, posix=False)
         paths = ["OUT" if Path(at.strip("'")).absolute() == folder else at for at in parts]
-        command = " ".join(paths)
-        do = finding.do and replace(finding.do, command=command)
-        findings.append(replace(finding, do=do))
-    verdict = replace(stiff.verdict, findings=tuple(findings))
-    result = Run(replace(stiff, verdict=verdict), ())
-    result = result.with_paths(options.session, options.out)
+        return replace(do, command=" ".join(paths))
+
+    findings = tuple(found.with_do(renamed) for found in stiff.verdict.findings)
+    verdict = replace(stiff.verdict, findings=findings)
+    result = Run(replace(stiff, verdict=verdict), ()).with_paths(options.session, options.out)
     written = write_outputs(options.out, None, result)
     enter(options, options.session, entries_of(result.calibration), options.out)
     if options.as_json:

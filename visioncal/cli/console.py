@@ -212,8 +212,6 @@ def with_run_paths(session: Path, out: Path | str = "") -> Iterator[None]:
         # Imported late, so that --help stays fast.
         from visioncal.core.verdict import with_paths
 
-        raise type(error)(
-            error.message,
-            culprits=error.culprits,
-            next_step=with_paths(error.next_step, session, out, ["visioncal", *sys.argv[1:]]),
-        ) from error
+        again = ["visioncal", *sys.argv[1:]]
+        step = with_paths(error.next_step, session, out, again)
+        raise error.but(next_step=step) from error

@@ -41,7 +41,7 @@ def guard_command(options: GuardOptions) -> None:
             guard.restore(parse_stored(read_text(options.state), str(options.state)))
         except DataError as error:
             step = "Delete it, if it is the guard's, which then learns anew; else name another."
-            raise DataError(error.message, culprits=[str(options.state)], next_step=step) from error
+            raise error.but(culprits=[str(options.state)], next_step=step) from error
     if sys.stdin.isatty():
         say("Looks are read from the keyboard, a JSON line each; Ctrl-D ends them.")
     holds, is_refused, count = guard.holds, False, 0

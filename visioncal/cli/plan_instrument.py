@@ -133,10 +133,9 @@ def _cell(
         try:
             found = calibrate(session)
         except DegenerateError as error:
-            raise DegenerateError(
+            raise error.but(
                 f"session {session.name!r} does not show where instrument and probe are: "
                 f"{error.message}",
-                culprits=error.culprits,
                 next_step="Give both roughly, by --cam and --board: what was recorded counts all "
                 "the same.",
             ) from error

@@ -78,11 +78,8 @@ def find_source(name: str) -> Source:
     try:
         return Source(f"robot {name}", robot=load_robot(name))
     except DataError as error:
-        raise DataError(
-            f"{name[:200]} is no session and no calibration, and as a robot: {error.message}",
-            culprits=[name[:200]],
-            next_step=error.next_step,
-        ) from error
+        begin = f"{name[:200]} is no session and no calibration, and as a robot"
+        raise error.but(f"{begin}: {error.message}", culprits=[name[:200]]) from error
 
 
 def chosen_part(source: Source, words: PlanOptions) -> tuple[Source, PlanOptions]:

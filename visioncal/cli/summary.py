@@ -91,14 +91,14 @@ def print_summary(
 
 
 def _not_in_verdict(verdict: Verdict, views: Sequence[ViewResult]) -> Iterator[ViewResult]:
-    """Views left out, but those of a finding that states the reasons of all its views."""
+    """Views left out, but those of a finding that states the one reason of all its views."""
     findings = [finding for finding in verdict.findings if finding.without_it]
     reasons = {view.view: view.reason for view in views}
     for view in views:
         of_view = [finding for finding in findings if view.view in finding.views]
         if not any(
             finding.kind != "wrong_views"
-            or all(reasons.get(at, "") in finding.words for at in finding.views)
+            or len({reasons[at] for at in finding.views if at in reasons}) < 2
             for finding in of_view
         ):
             yield view

@@ -21,6 +21,7 @@ from visioncal.results import select_matching
 from visioncal.results.history import entry_of_check
 from visioncal.session import Session
 from visioncal.verification import to_document, triggers_of, verdict_of, verify
+from visioncal.verification.triggers import LIMITS
 
 # Headings of the triggers by state, with their styles.
 _TRIGGERED = {
@@ -93,7 +94,7 @@ def verify_command(options: VerifyOptions) -> None:
                 trigger.words
                 for trigger in triggers
                 if trigger.state == state
-                and (state != "unknown" or any(column in trigger.words for column in had))
+                and (state != "unknown" or LIMITS[trigger.quantity][3] in had)
             )
             if words:
                 answer(words, begin, style)

@@ -28,15 +28,23 @@ class VisioncalError(Exception):
 
     def with_culprits(self, more: Sequence[str]) -> Self:
         """The same error with more culprits."""
-        culprits = (*self.culprits, *more)
-        return type(self)(self.message, culprits=culprits, next_step=self.next_step)
+        return self.but(culprits=(*self.culprits, *more))
+
+    def but(
+        self, message: str = "", culprits: Sequence[str] | None = None, next_step: str | None = None
+    ) -> Self:
+        """The same error with other parts."""
+        other = type(self)(
+            message or self.message,
+            culprits=self.culprits if culprits is None else culprits,
+            next_step=self.next_step if next_step is None else next_step,
+        )
+        other.__dict__ = vars(self) | vars(other)
+        return other
 
     def within(self, label: str) -> Self:
         """The same error with its message prefixed by a file, once."""
-        message = self.message
-        if not message.startswith(label):
-            message = f"{label}: {message}"
-        return type(self)(message, culprits=self.culprits, next_step=self.next_step)
+        return self.but("" if self.message.startswith(label) else f"{label}: {self.message}")
 
     def __str__(self) -> str:
         return f"{self.message} {self.next_step}".strip()

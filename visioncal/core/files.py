@@ -14,6 +14,8 @@ from typing import Any, BinaryIO
 from visioncal.core.errors import DataError
 from visioncal.core.temporary import temporary
 
+ABSENT = "does not exist"
+
 
 def sha256(data: bytes) -> str:
     """Computes the SHA-256 digest of `data`, in lower-case hexadecimal."""
@@ -158,7 +160,7 @@ def absence(path: Path) -> str:
             return ""
         if path.is_dir():
             return "is a folder, and no file"
-        return "is not a regular file" if path.exists() else "does not exist"
+        return "is not a regular file" if path.exists() else ABSENT
     except (OSError, ValueError) as error:
         words = error.strerror if isinstance(error, OSError) and error.strerror else error
         return f"cannot be read: {words}"

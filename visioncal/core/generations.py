@@ -66,8 +66,7 @@ def write_generation(
                 message, *culprits = (
                     name.replace(str(new), str(folder)) for name in (error.message, *error.culprits)
                 )
-                step = error.next_step
-                raise DataError(message, culprits=culprits, next_step=step) from error.__cause__
+                raise error.but(message, culprits=culprits) from error.__cause__
             written = [name for name in names if (new / name).exists()]
             if is_locked:
                 with _switch(folder, aside) as switch:

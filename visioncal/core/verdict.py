@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeAlias
@@ -41,8 +41,8 @@ CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 _BY_HAND = "Of several robots or cameras, correct the files by hand."
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
-# After a calibration's output stands the need that was typed.
-_PATH = re.compile(r"-o (?:OUT|NEW)\b|\b(?:SESSION|FIXED|OUT|NEW|AGAIN)\b")
+# After a calibration's output stands the need that was typed. An option's value may have a name.
+_PATH = re.compile(r"-o (?:OUT|NEW)\b|(?<![\w/:.,=-])(?:SESSION|FIXED|OUT|NEW|AGAIN)(?![\w:,=-])")
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,7 @@ class Option:
     name: str  # Without dashes.
     value: str = ""  # Its value; empty for none.
     views: tuple[int, ...] = ()  # The views that it is for; empty for all.
-    # (4, 4) the tool that it takes off poses, in the flange.
-    tool: FloatArray | None = field(default=None, compare=False)
+    tool: FloatArray | None = field(default=None, compare=False)  # (4, 4) taken off, in the flange.
 
     def __str__(self) -> str:
         words = ":".join(filter(None, [ranges(self.views), self.value]))
@@ -73,6 +72,8 @@ class Remedy:
     option: Annotated[Option, UNWRITTEN] = field(default=Option(""), compare=False)
     # Its words without the command, where these are others.
     plain: Annotated[str, UNWRITTEN] = field(default="", compare=False)
+    # Its words for stops that are verified, and make no calibration, where these are others.
+    of_check: Annotated[str, UNWRITTEN] = field(default="", compare=False)
 
     def __str__(self) -> str:
         is_shown = self.command and AGAIN not in self.command
@@ -97,11 +98,21 @@ def look_at(view: int) -> str:
     return f"{REVIEW} --view {view}"
 
 
-def mending(words: str, option: Option, first: str = "", end: str = ".") -> Remedy:
+def calibrating(first: str, then: str = "again.", command: str = CALIBRATE) -> Remedy:
+    """Advice that ends in a calibration, or in a verification where stops are verified."""
+    words, of_check = (f"{first} {do} {then}" for do in ("calibrate", "verify"))
+    return Remedy(words, command, of_check=of_check)
+
+
+def mending(words: str, option: Option, write: str = "Write", end: str = ".") -> Remedy:
     """Advice to write a copy of the session with an option of `convert`, and to calibrate it."""
-    write = f"{first}write" if first else "Write"
-    words = f"{write} a copy of the session in which {words}, and calibrate it{end}"
-    return Remedy(words).by(option)
+    first = f"{write} a copy of the session in which {words}, and"
+    return calibrating(first, f"it{end}").by(option)
+
+
+def again(words: str, option: Option) -> Remedy:
+    """Advice to repeat the typed command with an option."""
+    return Remedy(words, f"{AGAIN} {option}", option)
 
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:
@@ -117,8 +128,8 @@ def without(views: Sequence[int], residuals: str) -> str:
 
 
 BY_HAND = Remedy(f"Write a copy of the session that is read so, and calibrate it. {_BY_HAND}")
-READ_AGAIN = Remedy(
-    "Write a copy of the session that is read so, and calibrate it.", GUESS_AND_CALIBRATE
+READ_AGAIN = calibrating(
+    "Write a copy of the session that is read so, and", "it.", GUESS_AND_CALIBRATE
 )
 
 
@@ -166,6 +177,10 @@ class Finding:
             return self
         return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
 
+    def with_do(self, changed: Callable[[Remedy], Remedy]) -> Self:
+        """The same finding with its advice changed, if it has one."""
+        return self if self.do is None else replace(self, do=changed(self.do))
+
     def in_words(self) -> Self:
         """The same finding with all parts of its text in its words."""
         words = " ".join(filter(None, [self.words, self.consequence]))
@@ -180,10 +195,7 @@ class Finding:
 
 def of_cell(findings: Iterable[Finding], robots: int, cameras: int) -> tuple[Finding, ...]:
     """Findings with remedies for a session of some robots and cameras."""
-    return tuple(
-        found if found.do is None else replace(found, do=found.do.of_cell(robots, cameras))
-        for found in findings
-    )
+    return tuple(found.with_do(lambda do: do.of_cell(robots, cameras)) for found in findings)
 
 
 def remarks(sentences: Iterable[str], kind: str = "remark") -> tuple[Finding, ...]:
@@ -301,15 +313,11 @@ class Verdict:
         every = [finding.do.command for finding in self.findings if finding.do is not None]
         copies = [*dict.fromkeys(command for command in every if "FIXED" in command)]
 
-        def filled(finding: Finding) -> Finding:
-            if finding.do is None:
-                return finding
-            command = finding.do.command
-            copy = copies.index(command) if command in copies else 0
-            command = with_paths(command, session, out, again, need, copy=copy)
-            return replace(finding, do=replace(finding.do, command=command))
+        def filled(do: Remedy) -> Remedy:
+            copy = copies.index(do.command) if do.command in copies else 0
+            return replace(do, command=with_paths(do.command, session, out, again, need, copy=copy))
 
-        return replace(self, findings=tuple(map(filled, self.findings)))
+        return replace(self, findings=tuple(found.with_do(filled) for found in self.findings))
 
 
 def need_options(

@@ -208,7 +208,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
     except DataError as error:
         for finding in named:
             words, step = f"fixture: {finding.words}", finding.do.words if finding.do else ""
-            raise DataError(words, culprits=error.culprits, next_step=step) from error
+            raise error.but(words, next_step=step) from error
         raise
     # Probable cause if a point is an outlier.
     cause = "it was missed, or named as another, or the part is not there as drawn"

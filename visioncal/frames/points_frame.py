@@ -11,7 +11,7 @@ from visioncal.core.directions import Direction
 from visioncal.core.limits import FixtureLimits, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import Mask
-from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
+from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Option, Remedy, Verdict, again
 from visioncal.frames.group_outliers import GroupInliers
 from visioncal.results import Edge, Frame, Observation
 
@@ -161,9 +161,9 @@ class PointsFit:
                 "noise",
                 "The touches scatter by more than they are stated to, without one that stands out: "
                 f"{figure(noise_mm)} mm per axis.",
-                Remedy(
+                again(
                     "Repeat them, or state the noise as it is.",
-                    f"{AGAIN} --touch-noise-mm {noise_mm:.2g}",
+                    Option("touch-noise-mm", f"{noise_mm:.2g}"),
                 ),
             )
         limits = setting.options

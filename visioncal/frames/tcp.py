@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import CLEAR_RATIO, WIDE_RAD, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
-from visioncal.core.verdict import AGAIN, Finding, Remedy
+from visioncal.core.verdict import AGAIN, Finding, Option, Remedy, again
 from visioncal.estimation.points import FEWEST_POINTS
 from visioncal.frames.pivot import (
     PivotFit,
@@ -37,7 +37,7 @@ _INVERSE = Finding(
     "inverse_poses",
     "The tip would be farther from the flange than the point from the base: poses read the other "
     "way round look like this.",
-    Remedy("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
+    again("If the columns hold flange_from_base, say so.", Option("robot-inverse")),
 )
 
 
@@ -93,8 +93,8 @@ def touched_tool(
             other = _INVERSE
         if other is None or other.do is None:
             raise
-        command = other.do.command.removeprefix(AGAIN).strip()
-        step = f"{other.do.words[:-1]}{command and ': '}{command}."
+        option = f": {other.do.option}" if other.do.option.name else ""
+        step = f"{other.do.words.removesuffix('.')}{option}."
         raise DataError(f"tcp: {other.words}", culprits=[rows.source], next_step=step) from error
     fitted = PointsFit(
         rows.source,
@@ -173,9 +173,9 @@ def _other_reading(touches: Touches, numbers: PoseNumbers | None, limit_m: float
         f"The touches agree to {figure(1e3 * least_m)} mm (rms) with their rotations in another "
         f"form, {some_of(rivals, 3)}; and to {figure(1e3 * declared_m)} mm as they are read."
     )
-    remedy = Remedy(
+    remedy = again(
         "Look up the controller's form, and state it.",
-        f"{AGAIN} --robot-form {rivals[0]}",
+        Option("robot-form", rivals[0]),
     )
     return Finding("other_reading", words, remedy, is_fatal=True)
 

@@ -78,11 +78,11 @@ class CalibrationContent(CalibrationSections):
     @property
     def unstated_conditions(self) -> tuple[str, ...]:
         """The conditions that no finding of the verdict states, in words."""
-        stated = [finding.words for finding in self.verdict.findings]
+        stated = {finding.kind for finding in self.verdict.findings}
         return tuple(
             condition.words
             for condition in self.conditions
-            if not any(words in condition.sentence for words in stated)
+            if condition.kind != "calibrated-arm" or "calibrated_arm" not in stated
         )
 
     def controller(self, *frames: str) -> PoseForm | None:

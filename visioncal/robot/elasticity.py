@@ -11,6 +11,7 @@ from visioncal.robot.model import Robot
 
 # Prior of a compliance of which nothing is known: a gear of 10 kN m/rad [rad/(N m)].
 SOFT = 1e-4
+BY_CONTROLLER, OF_MASSES = "compensated by the controller", "of the model's masses"
 
 
 def deflected_joints(
@@ -107,5 +108,5 @@ class WeightFunctions:
 def weight_words(robot: Robot) -> str:
     """Where the deflection by the links' own weight comes from."""
     if robot.weight_compensated:
-        return "compensated by the controller"
-    return "unknown" if robot.masses is None else "of the model's masses"
+        return BY_CONTROLLER
+    return "unknown" if robot.masses is None else OF_MASSES

@@ -314,11 +314,8 @@ def read_declaration(document: Mapping[str, Any], *, observed: bool) -> Declarat
         declaration = read(Declaration, content, "")
         _check_consistent(declaration, observed)
     except DataError as error:
-        raise DataError(
-            f"session.toml: {error.message}",
-            culprits=[f"session.toml: {culprit}" for culprit in error.culprits],
-            next_step=error.next_step,
-        ) from error
+        message, *culprits = (f"session.toml: {part}" for part in (error.message, *error.culprits))
+        raise error.but(message, culprits=culprits) from error
     return declaration
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
+from visioncal.core.files import ABSENT, MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
 from visioncal.core.types import Searched
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+MISSING = "is missing"
 CLOUD_ENDINGS = (".ply", ".pcd", ".npy")
 _Place = TypeVar("_Place")
 
@@ -81,7 +82,7 @@ class FolderImages(ImageStore):
         file = self.folder / inside_path(path)
         why_not = absence(file)
         if why_not:
-            return why_not.replace("does not exist", "is missing")
+            return MISSING if why_not == ABSENT else why_not
         parent = self.folder.resolve().parent
         # Directly below the root, everything would be beside the folder.
         is_beside = parent != parent.parent and is_inside(file.parent, parent)
@@ -113,7 +114,7 @@ class ListedImages(ImageStore, Generic[_Place]):
 
     def absence(self, path: str) -> str:
         """Why there is no such image; empty where there is one."""
-        return "" if path in self.files else "is missing"
+        return "" if path in self.files else MISSING
 
 
 class MemoryImages(ListedImages[bytes]):

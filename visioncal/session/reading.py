@@ -45,7 +45,7 @@ def session_text(path: Path) -> str:
             else _conversion_of(path)
         )
         message = error.message if path.is_dir() else f"{path} must be the folder of a session."
-        raise DataError(message, culprits=error.culprits, next_step=step) from error
+        raise error.but(message, next_step=step) from error
 
 
 def _may_hold_images(folder: Path, endings: set[str]) -> bool:

@@ -22,7 +22,7 @@ from visioncal.session.corners import (
 from visioncal.session.images import FolderImages, MemoryImages
 from visioncal.session.reading import session_text
 from visioncal.session.saving import digest_of, save_session
-from visioncal.session.selecting import Choice, keep_views, select
+from visioncal.session.selecting import Choice, is_whole_cell, keep_views, select
 from visioncal.session.streams import Stream, read_streams
 from visioncal.session.table import check_times, parse_csv
 from visioncal.vision.boards.picture import with_weights
@@ -141,6 +141,11 @@ class Session(SessionContent):
 
     def _repr_html_(self) -> str:
         return html_card(f"Session {self.name}", self._facts, says=self.warnings)
+
+    @property
+    def has_one_pair(self) -> bool:
+        """Whether it has one camera or instrument and one robot: no whole cell."""
+        return not is_whole_cell(self)
 
     @property
     def _facts(self) -> dict[str, str]:

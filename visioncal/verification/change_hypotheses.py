@@ -75,14 +75,15 @@ def causes_of(
         if not shown.any():
             continue
         by_size = np.where(shown[:, None, None], nearer, 0.0)
-        size = ChangeHypothesis(f"{SIZE} {names[index]}".strip(), np.ones(1), by_size, at=at)
+        size = ChangeHypothesis(SIZE, np.ones(1), by_size, at=at, of=names[index])
         causes.append(size)
         if board_placed_anew:
             continue
         # The board's edge: a twist on its right.
         by_place = np.where(shown[:, None, None], -np.eye(6), 0.0)
-        start, name = log(mean_transform(away[shown])), f"{BOARD} {names[index]}".strip()
-        place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at, shapes=_KNOCKS)
+        start = log(mean_transform(away[shown]))
+        place = ChangeHypothesis(BOARD, MOTION_UNITS, by_place, start=start, at=at, shapes=_KNOCKS)
+        place = replace(place, of=names[index])
         # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
         other = replace(size, units=np.array([10.0]))
         causes += [place, _simultaneous(REPLACED, place, other)]
@@ -143,12 +144,13 @@ def _simultaneous(kind: str, one: ChangeHypothesis, other: ChangeHypothesis) -> 
     """Two simultaneous changes of the sensor's side."""
     start = np.zeros(len(one.units)) if one.start is None else one.start
     parts = [part.by_sensor for part in (one, other) if part.by_sensor is not None]
-    return ChangeHypothesis(
-        f"{kind} {other.name.partition(' ')[2]}".strip(),
-        np.concatenate([one.units, other.units]),
-        np.concatenate(parts, axis=2),
+    return replace(
+        other,
+        kind=kind,
+        units=np.concatenate([one.units, other.units]),
+        by_sensor=np.concatenate(parts, axis=2),
         start=np.concatenate([start, np.zeros(len(other.units))]),
-        at=other.at,
+        shapes=(),
     )
 
 
@@ -170,8 +172,8 @@ def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Chan
     for joint in range(arm.joint_count):
         unit = np.array([1.0 if arm.chain.prismatic[joint] else TURN_PER_M])
         by_flange = offsets[:, :, joint : joint + 1]
-        name = f"{JOINT} {joint + 1}"
-        yield ChangeHypothesis(name, unit, flange_jacobian=by_flange, at=joint)
+        of = f"{joint + 1}"
+        yield ChangeHypothesis(JOINT, unit, flange_jacobian=by_flange, at=joint, of=of)
     yield from _load(predicted, prior, model, offsets)
 
 
@@ -209,11 +211,12 @@ def _views(
         # All boards of a stop move together.
         transform = adjoint(invert(boards) @ boards[first])
         yield ChangeHypothesis(
-            f"{VIEW} {predicted.views[first]}",
+            VIEW,
             MOTION_UNITS,
             np.where(at_stop[:, None, None], -transform, 0.0),
             start=changes[first],
             at=int(predicted.boards[first]),
+            of=str(predicted.views[first]),
         )
 
 

@@ -18,8 +18,10 @@ from visioncal.core.verdict import (
     DEPTH_CHANGED,
     PLAN,
     Finding,
+    Option,
     Remedy,
     Verdict,
+    again,
 )
 from visioncal.robot.model import joint_words
 from visioncal.verification.change_hypotheses import (
@@ -82,9 +84,9 @@ _KINDS = {
     ),
     BOARD: (
         "the {name} {moved}{or_frame}",
-        Remedy(
+        again(
             "Put the board back; if it was moved on purpose, verify without its place.",
-            f"{AGAIN} --board-moved",
+            Option("board-moved"),
         ),
     ),
     BOTH: (
@@ -228,7 +230,7 @@ def change_words(check: Check, change: PossibleChange) -> str:
         "or_frame": _or_frame(check, change, found),
         "or_joint": "" if has_joints else _OR_JOINT,
         "name": change.name,
-        "board": f"board {change.name.partition(' ')[2]}".strip(),
+        "board": f"board {change.cause.of}".strip(),
         "moved": _moved_words(found.get(CAMERA, found)),
         "other": _moved_words(found.get(BOARD, {})),
         "larger": "larger" if share > 0.0 else "smaller",

@@ -1,15 +1,13 @@
 """Stops whose poses or joint angles are misread: no change of a cell explains these."""
 
-import re
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import chain
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import misread_poses
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import CALIBRATE, CALIBRATE_FIXED, Finding, Remedy
 
-_CALIBRATING = re.compile(r"visioncal calibrate (\w+) -o OUT")
+_VERIFY, _VERIFY_FIXED = (f"visioncal verify {at} --against OUT" for at in ("SESSION", "FIXED"))
 
 
 def misreading(run: RunState) -> Finding | None:
@@ -30,8 +28,9 @@ def misread_joints(run: RunState) -> Finding | None:
 def _of_check(findings: Iterable[Finding]) -> Finding | None:
     """The first finding, its step for stops that are verified: these make no calibration."""
     found = next(iter(findings), None)
-    if found is None or found.do is None:
-        return found
-    command = _CALIBRATING.sub(r"visioncal verify \1 --against OUT", found.do.command)
-    words = found.do.words.replace("calibrate", "verify")
-    return replace(found, do=Remedy(words, command))
+    return found and found.with_do(_verifying)
+
+
+def _verifying(do: Remedy) -> Remedy:
+    command = do.command.replace(CALIBRATE, _VERIFY).replace(CALIBRATE_FIXED, _VERIFY_FIXED)
+    return Remedy(do.of_check or do.words, command)

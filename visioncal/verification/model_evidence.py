@@ -63,7 +63,7 @@ class CalibrationPosterior:
 class ChangeHypothesis:
     """A change that may have happened since the calibration, of p unknowns."""
 
-    name: str  # Its kind in one word, and what it is of, as `joint 3`.
+    kind: str  # Its kind in one word.
     units: FloatArray  # (p,) the size of each unknown, for a change of one metre.
     # (n, 6, p) right perturbations of the measured poses that undo it; None for none.
     by_sensor: FloatArray | None = None
@@ -79,11 +79,12 @@ class ChangeHypothesis:
     shapes: tuple[FloatArray, ...] = ()
     # Views whose images belong to the poses of others, and these.
     pairs: tuple[tuple[int, int], ...] = ()
+    of: str = ""  # The name or number of the part that it is of, where there may be several.
 
     @property
-    def kind(self) -> str:
-        """Kind of the hypothesis."""
-        return self.name.partition(" ")[0]
+    def name(self) -> str:
+        """Kind and part, as `joint 3`."""
+        return f"{self.kind} {self.of}".strip()
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,12 +78,11 @@ def causes_found(check: Check) -> tuple[str, ...]:
     """The change by the check alone; empty where it is not one that can be recovered."""
     if len(check.named) != 1:
         return ()
-    name = check.named[0].name
-    kind, _, of = name.partition(" ")
-    if kind == BOTH:
+    cause = check.named[0].cause
+    if cause.kind == BOTH:
         # A check takes large motions of both to first order: the proof says whether they explain.
-        return CAMERA, f"{BOARD} {of}".strip()
-    return (name,) if check.explained and kind in _RECOVERABLE else ()
+        return CAMERA, replace(cause, kind=BOARD).name
+    return (cause.name,) if check.explained and cause.kind in _RECOVERABLE else ()
 
 
 def recover(
@@ -163,7 +162,7 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
     old, prior, fit = check.calibration, check.prior, check.prior.fit
     possible = {at.name: at.cause for at in check.compared if at.cause.kind in _RECOVERABLE}
     names = parts_changed(old, causes, possible)
-    joints = [name for name in names if name.startswith(JOINT)]
+    joints = [name for name in names if possible[name].kind == JOINT]
     # Causes of edges come first.
     chosen = sorted((possible[name] for name in names), key=lambda cause: cause.kind == JOINT)
     moved = [0 if at.kind == CAMERA else 1 + at.at for at in chosen if at.kind != JOINT]

@@ -14,7 +14,7 @@ from visioncal.session import Session
 State: TypeAlias = Literal["fired", "quiet", "unknown"]
 
 # Quantities in words, with usual limit, unit and the column of the sessions that has it.
-_LIMITS = {
+LIMITS = {
     "ambient_change_k": ("the ambient temperature's change", 10.0, "K", "ambient_c"),
     "payload_change_kg": ("the payload's change", 5.0, "kg", "payload_kg"),
     "age_days": ("the calibration's age", 365.0, "days", ""),
@@ -60,7 +60,7 @@ def triggers_of(
         Trigger("failed_check", "fired" if failed else "quiet", "a failed check"),
         Trigger("collision", "fired" if collision else "quiet", "a collision"),
     ]
-    for quantity, (label, usual, unit, column) in _LIMITS.items():
+    for quantity, (label, usual, unit, column) in LIMITS.items():
         limit = usual if (stated := limits.get(quantity)) is None else stated
         found = (
             _change(session, calibration, column)

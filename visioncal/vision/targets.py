@@ -214,7 +214,7 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
         return KINDS[table.choice("kind", tuple(KINDS))].read(table, name)
     except DataError as error:
         hint = error.next_step or " ".join(misspelt_keys(document))
-        raise type(error)(error.message, culprits=error.culprits, next_step=hint) from error
+        raise error.but(next_step=hint) from error
 
 
 def target_document(target: Target) -> dict[str, Any]:

@@ -225,7 +225,7 @@ class SeenRows:
         problem, part, state = self.problem, cell_fit.fit.problem, cell_fit.fit.state
         predicted = problem.predicted(state)
         away_m, away_rad = pose_residuals(problem, state, predicted)
-        if cell_fit.cell.mount is not None:
+        if cell_fit.cell.session.has_one_pair:
             fitted = np.isin(problem.observations.observed, part.observations.observed)
             mean_m, mean_rad = scatter(problem.subset(fitted), part, state)
             away_m[fitted] = mean_m

@@ -128,10 +128,11 @@ def middles_of(cell: Cell) -> dict[str, FloatArray]:
 def _sources(cell_fit: CellFit, fit: Fit) -> Sources:
     """Sources of uncertainty by camera, robot and board; without names for a single pair."""
     problem, mount, by_source = fit.problem, cell_fit.cell.mount, dict[str, IntArray]()
+    is_pair = cell_fit.cell.session.has_one_pair
     rest = [unknown for unknown in fit.unknowns.parts if unknown.kind not in (EDGE, *_OPTICAL)]
     for unknown in (*rest, *fit.unknowns.all_of(*_OPTICAL)):
         source = _OPTICAL.get(unknown.kind, unknown.kind)
-        if mount is not None:
+        if is_pair:
             source = source if source in (*_SOURCES, *_OPTICAL.values()) else "clock"
         elif unknown.kind != LENS_ERRORS:
             between = " " if unknown.kind == BOARD else " of "
@@ -139,7 +140,7 @@ def _sources(cell_fit: CellFit, fit: Fit) -> Sources:
         if len(columns := fit.unknowns.columns(unknown)):
             by_source[source] = np.append(by_source.get(source, columns[:0]), columns)
     observers = problem.observations.observers
-    if mount is not None:
+    if is_pair:
         kind, robot = "pixels", "poses" if problem.is_combined else "robot"
         kind = "instrument" if mount == "instrument" else kind
         return Sources(

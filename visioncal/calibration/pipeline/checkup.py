@@ -1,7 +1,8 @@
 """Checks a session for mistakes before anything is fitted, for `visioncal doctor`."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 
@@ -80,10 +81,10 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
     if error is None:
         findings = [*of_cell(findings, len(run.robots), len(run.cameras))]
     if not isinstance(session, Session):
-        for at, finding in enumerate(findings):
-            if (do := finding.do) is not None:
-                words, command = (with_paths(text, session) for text in (do.words, do.command))
-                findings[at] = replace(finding, do=Remedy(words, command))
+        fill = partial(with_paths, session=session)
+        findings = [
+            found.with_do(lambda do: Remedy(fill(do.words), fill(do.command))) for found in findings
+        ]
     return Checkup(run.session.name, tuple(_contents(run)), tuple(findings))
 
 
@@ -166,7 +167,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
         noise, words = starting_noise(problem), words_of(cell, problem, can_tilt=run.can_tilt)
         px = {frame: look.pixel_px for frame, look in run.cameras.items() if look.pixel_px}
         check_determined(problem, start.state, noise, words, px)
-        if cell.mount is None:
+        if not run.session.has_one_pair:
             return
         inliers = initial_inliers(start)
     except VisioncalError as error:

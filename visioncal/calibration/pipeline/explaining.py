@@ -20,13 +20,11 @@ def explained(
     """An error of a stage by its likeliest cause, or with the command for more views, or None."""
     cause = unseen_cause(state) or (poor_motion(state) if stage == "intrinsics" else None)
     if cause is not None:
-        words, step = f"{cause.words} {error.message}", str(cause.do or "")
-        return type(error)(words, culprits=error.culprits, next_step=step)
-    is_pair = state.mount is not None
+        return error.but(f"{cause.words} {error.message}", next_step=str(cause.do or ""))
+    is_pair = state.session.has_one_pair
     # Of a whole cell, views that a mistake explains were left out before the fit.
     for found in (at for at in state.warnings if at.kind in UNDONE and not is_pair):
-        words = f"{found.words} {error.message}"
-        return type(error)(words, culprits=error.culprits, next_step=str(found.do or ""))
+        return error.but(f"{found.words} {error.message}", next_step=str(found.do or ""))
     if is_pair and not are_located:
         return None
     state = with_misreading(state)
@@ -36,9 +34,8 @@ def explained(
         return type(error)(misread.words, next_step=str(misread.do))
     if isinstance(error, DegenerateError) and (words := _open_chain(state)):
         return DegenerateError(words, next_step=str(UNRECORDED))
-    if (plan := more_views(error, state)) is None:
-        return None
-    return type(error)(error.message, culprits=error.culprits, next_step=str(plan))
+    plan = more_views(error, state)
+    return None if plan is None else error.but(next_step=str(plan))
 
 
 def _open_chain(state: RunState) -> str:
@@ -59,7 +56,7 @@ def _open_chain(state: RunState) -> str:
 
 def more_views(error: VisioncalError, state: RunState) -> Remedy | None:
     """The command for more views where these determine too little; None where it has none."""
-    can = state.mount is not None and (state.robot is None or state.robot.can_tilt)
+    can = state.session.has_one_pair and (state.robot is None or state.robot.can_tilt)
     if not (can and state.scenes and isinstance(error, DegenerateError)):
         return None
     purpose = "" if state.level in ("auto", "hand-eye") else " --for kinematics"

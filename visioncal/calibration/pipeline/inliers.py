@@ -54,7 +54,7 @@ def initial_inliers(start: Start) -> InlierFit:
         problem = problem.with_effects([*problem.effects, sizes])
         state = State(state.edges, np.append(state.values, [*known.values()]))
     loose = replace(problem, priors=with_loose_positions(cell.priors))
-    if cell.mount is None or agreeing is None:
+    if agreeing is None or not cell.session.has_one_pair:
         inliers = inliers_and_moves(loose, state, movable, agreeing)
     else:
         inliers = presumed_inliers(loose, state, agreeing)
@@ -72,7 +72,7 @@ def initial_inliers(start: Start) -> InlierFit:
 def _with_creeps(start: Start, problem: Problem) -> tuple[Problem, State]:
     """The problem at its start with the frames that creep, by the one likelihood."""
     state = start.state
-    if start.solved is None or start.cell.mount is not None:
+    if start.solved is None or start.cell.session.has_one_pair:
         return problem, state
     fit = start.solved.fit
     for effect in fit.unknowns.opened:
@@ -101,7 +101,7 @@ def _with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], problem: Problem
     # Corners of one image may have a common error, as those of small squares do: poses then
     # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
     # once a stop, that is part of the robot's noise.
-    is_single = cell.mount is not None and len(problem.units[1]) == len(problem)
+    is_single = cell.session.has_one_pair and len(problem.units[1]) == len(problem)
     if is_single or problem.is_combined:
         return problem
     sensors = sensors_of(cell, poses)
@@ -138,7 +138,7 @@ def _with_priors(cell: Cell, inliers: InlierFit) -> InlierFit:
 def _movable_frames(cell: Cell, problem: Problem) -> tuple[str, ...]:
     """Frames that may have moved during the session: all unknown ones but bases."""
     # One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
-    if cell.mount is not None:
+    if cell.session.has_one_pair:
         return ()
     bases = problem.tree.bases.values()
     return tuple(name for name in problem.tree.unknown if name not in bases)

@@ -86,7 +86,7 @@ def findings_of(run: RunState) -> Findings:
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst = _worst(run)
     return Findings(
-        _pairs(connected, explained | answer.marginal, answer, is_single=run.mount is not None),
+        _pairs(connected, explained | answer.marginal, answer, is_single=run.session.has_one_pair),
         _sensors(connected, run),
         _arms(run),
         worst,
@@ -120,7 +120,7 @@ def _use(run: RunState) -> Remedy:
     stated = next((robot.form for robot in run.session.robots.values()), None)
     form = controller_form("" if run.robot is None else run.robot.name, stated)
     words, command = "Locate things by the camera", "locate SESSION -c OUT"
-    if run.mount is None:
+    if not run.session.has_one_pair:
         words, command = "Take the frames to another program", "export OUT --to ros --edge all"
     elif form is not None:
         to = form.name if form.models or form.name == "ros" else "urdf"
@@ -172,7 +172,7 @@ def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, Floa
 def _worst(run: RunState) -> list[Direction]:
     """The least certain directions of the unknown frames, the worst first."""
     answer, cell, fit = run.assessment, run.cell_fit.cell, run.assessment.fit
-    if run.mount is not None:
+    if run.session.has_one_pair:
         names = chain_words(fit.problem, run.session.mount).names
         found = directions(fit.problem, fit.state, fit.whole, names)
         return [direction for _, direction in found]
@@ -276,7 +276,7 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
 def _arms(run: RunState) -> list[JudgedArm]:
     answer, cell_fit = run.assessment, run.cell_fit
     problem, arms = answer.fit.problem, []
-    budget = {} if run.mount is None else run.uncertainty.budget_mm
+    budget = run.uncertainty.budget_mm if run.session.has_one_pair else {}
     for index, (robot, intervals) in enumerate(zip(problem.robots, answer.intervals, strict=True)):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm

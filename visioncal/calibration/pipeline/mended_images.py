@@ -134,7 +134,7 @@ def _is_mirrored(state: RunState | None) -> bool:
     ):
         return False
     with suppress(VisioncalError):
-        if state.mount is not None:
+        if state.session.has_one_pair:
             guess = guess_from_camera_poses(state)
             return guess.stands_out and guess.best.hypothesis.robot.mirrored
     return False
@@ -150,7 +150,7 @@ def _by_motion(session: Session, located: RunState | None) -> Session | None:
 
 def _exchanged_in_cell(state: RunState | None) -> list[int]:
     """Views of those cameras of a whole cell whose lenses show u and v of corners exchanged."""
-    if state is None or state.mount is not None:
+    if state is None or state.session.has_one_pair:
         return []
     pairs = ((robot, pair) for robot in state.session.robots for pair in pairs_of(state, robot))
     cameras = {

@@ -67,7 +67,7 @@ def read_cell_inputs(run: RunState) -> RunState:
 def _not_used(run: RunState) -> Iterator[Finding]:
     """Reports declarations and columns that no stage can use."""
     session = run.session
-    if run.mount is None:
+    if not session.has_one_pair:
         return
     names = pair_edges(session)
     for edge in session.declaration.prior:
@@ -109,7 +109,7 @@ def _suspicious(session: Session) -> Iterator[Finding]:
 def _reported(run: RunState) -> RunState:
     """Reads the robots' reported poses."""
     run, session = read_robots(run), run.session
-    if run.mount is None:
+    if not session.has_one_pair:
         return run
     matched = run.reported.matched
     if matched is not None and matched.misread:

@@ -73,7 +73,7 @@ def result_of(run: RunState) -> Calibration:
     findings, verdict = run.findings, run.verdict
     if findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
-    session, answer, is_pair = run.session, run.assessment, run.mount is not None
+    session, answer, is_pair = run.session, run.assessment, run.session.has_one_pair
     names = _edge_names(run)
     was_left_out = np.isfinite(answer.held_out.residual_m).any()
     cell = None if is_pair else _cell(run, names)
@@ -111,7 +111,7 @@ def _edge_names(run: RunState) -> dict[str, str]:
     problem = answer.fit.problem
     # In the order of the fit, whose covariance has a frame that moved at the end.
     parents = {answer.versions[key]: problem.tree.branches[key].parent for key in problem.unknown}
-    if run.mount is None:
+    if not run.session.has_one_pair:
         return {frame: f"{parent}_from_{frame}" for frame, parent in parents.items()}
     # The root of a pair's frames is the robot's base; its camera and its robot need no names.
     kinds = {CELL: "base"} | {

@@ -21,7 +21,6 @@ from visioncal.core.types import Corners, Mount, Progress
 from visioncal.results import Verdict
 from visioncal.results.sections import UncertaintyResult
 from visioncal.session import Session
-from visioncal.session.selecting import is_whole_cell
 
 _T = TypeVar("_T")
 
@@ -66,7 +65,7 @@ class RunState(Observed):
     @property
     def mount(self) -> Mount | None:
         """Mount of the camera, of one camera and one robot; None for a whole cell."""
-        return None if is_whole_cell(self.session) else self.session.mount
+        return self.session.mount if self.session.has_one_pair else None
 
     @property
     def cell(self) -> Cell:
@@ -130,7 +129,7 @@ def initial_state(session: Session | Path | str, **options: Unpack[CalibrationOp
         level=options.get("level", "auto"),
         convention=options.get("convention"),
     )
-    if state.mount is None and solver != "joint":
+    if not state.session.has_one_pair and solver != "joint":
         raise DataError(
             f"solver {solver} is not for a whole cell, which takes the joint solver.",
             culprits=["--solver"],

@@ -81,7 +81,7 @@ def solve(
     """
     arms: Mapping[str, RobotArm] = arms_of(cell, observed.robots)
     check_arms(arms, level)
-    if cell.mount is not None:
+    if cell.session.has_one_pair:
         can = solver == "joint" and all(arm.is_modelled for arm in arms.values())
         check_level_is_possible(level, can=can)
     if solver != "joint":
@@ -151,9 +151,9 @@ def _fit(
         with_effects = replace(cell_fit, other_effects=(*others, *found), gains=gains)
         cell_fit = _fit_with_inliers(with_effects, observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
-    final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
+    is_final = cell.session.has_one_pair and not cell.priors
     nominal = cell_fit
-    cell_fit, noise = _calibrate_arms(nominal, observed, final)
+    cell_fit, noise = _calibrate_arms(nominal, observed, cell_fit.inlier_fit if is_final else None)
     if sizes:
         # Boards of another size look as other lengths of an arm do. Slopes by a size are those at
         # the poses of the fit before, which a size of some percent moves.
@@ -326,7 +326,7 @@ def _fit_with_inliers(start: CellFit, observed: Observed) -> CellFit:
         if any(arm.errors and arm.errors.is_significant for arm in cell_fit.arms.values()):
             cell_fit = replace(cell_fit, linearised_corners=None)
         cell_fit = _fit_lenses_and_frames(replace(cell_fit, arms=start.arms), observed)
-        if cell_fit.cell.mount is None:
+        if not cell_fit.cell.session.has_one_pair:
             break
         before = cell_fit.inlier_fit.used
         cell_fit = replace(cell_fit, inlier_fit=refine_inliers(cell_fit.inlier_fit))

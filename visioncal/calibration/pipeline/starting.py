@@ -117,7 +117,7 @@ def _is_start(solved: CellFit, cell: Cell) -> bool:
     cell frames may have moved by less: only a board of another size is no less clear, with which
     the poses of no half of the rows agree otherwise.
     """
-    is_pair, opened = cell.mount is not None, solved.fit.unknowns.opened
+    is_pair, opened = cell.session.has_one_pair, solved.fit.unknowns.opened
     # Share from which a board is of another size: some sigma of a print that is as stated.
     is_sized = any(abs(share) > 5e-3 for share in scales_of(solved).values())
     is_still = not any(effect.place == "edge" for effect in opened)
@@ -229,7 +229,7 @@ def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
     One camera or instrument with one robot has none: its noise is the stated one, and the excess
     is the robot's.
     """
-    if cell.mount is not None:
+    if cell.session.has_one_pair:
         return ()
     pairs = zip(cell.rows, views, strict=True)
     return tuple(dict.fromkeys(row.seer for row, view in pairs if _is_sensed(row.seer, view)))

@@ -16,7 +16,6 @@ from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.document import PriorTable
 from visioncal.session.frames import edge_names
 from visioncal.session.kinds import has_robot_state, is_camera_observation, name_of
-from visioncal.session.selecting import is_whole_cell
 from visioncal.session.tree import Branch, Tree
 
 _CELL = "cell"
@@ -84,7 +83,7 @@ class Cell:
     @property
     def mount(self) -> Mount | None:
         """Mount of the camera of a single camera and robot; None of a whole cell."""
-        return None if is_whole_cell(self.session) else self.session.mount
+        return self.session.mount if self.session.has_one_pair else None
 
     def without(self, reasons: Mapping[int, str]) -> "Cell":
         """Returns the cell without some views."""

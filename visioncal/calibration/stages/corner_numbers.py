@@ -16,16 +16,16 @@ from visioncal.calibration.stages.other_board import MEND_IMAGES, OtherBoardErro
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import Corners, FloatArray, Mask, Rejection, Target
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy, calibrating
 from visioncal.session import Session, View
 from visioncal.vision.corners import far_outside
 from visioncal.vision.detection import lack_of_corners
 from visioncal.vision.poses import FEWEST_CORNERS
 from visioncal.vision.targets import corner_positions, otherwise, point_numbers
 
-EXCHANGE_COLUMNS = Remedy(
-    "Write a copy of the session in which u_px is counted to the right and v_px down, and "
-    "calibrate it.",
+EXCHANGE_COLUMNS = calibrating(
+    "Write a copy of the session in which u_px is counted to the right and v_px down, and",
+    "it.",
     MEND_IMAGES,
 )
 # Largest homography residual with the right counts, as a share of the corners' spread.

@@ -44,7 +44,7 @@ def scaling(first: str, factor: float, board: str = "") -> Remedy:
     """Advice to scale a board, of several by its name, after a measurement that comes first."""
     option = Option("board-scale", f"{f'{board}:' * bool(board)}{factor:.5g}")
     words = f"the board is {factor:.5g} times as large"
-    return mending(words, option, first, "; else check the arm.")
+    return mending(words, option, f"{first}write", "; else check the arm.")
 
 
 def other_size(share: float, variance: float, further: str = "") -> Finding:

@@ -14,7 +14,7 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag, TwoSlopes
 from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
-from visioncal.robot.elasticity import SOFT, weight_words
+from visioncal.robot.elasticity import BY_CONTROLLER, OF_MASSES, SOFT, weight_words
 from visioncal.robot.errors import ArmErrors
 from visioncal.robot.loads import load_ranges
 
@@ -218,7 +218,7 @@ def remarks(elastic: ElasticResult) -> Iterator[str]:
                 f"{slopes.knee_nm:.0f} N m, and {beyond} beyond. Targets are corrected by the one "
                 "slope that fits best: calibrate under the load of the work."
             )
-    if elastic.weight.startswith("compensated"):
+    if elastic.weight == BY_CONTROLLER:
         yield (
             "Loads bend the arm, and its own weight does not: its controller compensates that, as "
             "those of KUKA and ABB do."
@@ -234,7 +234,7 @@ def remarks(elastic: ElasticResult) -> Iterator[str]:
 def doubts(elastic: ElasticResult) -> Iterator[Finding]:
     """Findings where the stated load contradicts the deflection."""
     factor = elastic.payload_factor
-    if factor is not None and elastic.weight.startswith("of ") and factor.is_off:
+    if factor is not None and elastic.weight == OF_MASSES and factor.is_off:
         more = "heavier or hangs farther out" if factor.value > 1.0 else "lighter or hangs nearer"
         yield Finding(
             "load",

@@ -10,7 +10,7 @@ from visioncal.core.number_format import row_words, some_of
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
-from visioncal.session.images import IMAGE_ENDINGS, FolderImages
+from visioncal.session.images import IMAGE_ENDINGS, MISSING, FolderImages
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
 
@@ -18,7 +18,7 @@ from visioncal.session.selecting import is_whole_cell
 def missing_images(session: Session) -> Finding | None:
     """Finding on images that rows name and that do not exist."""
     searched = [view for view in session.views if view.image and not view.has_corners]
-    missing = [view for view in searched if session.images.absence(view.image) == "is missing"]
+    missing = [view for view in searched if session.images.absence(view.image) == MISSING]
     if not missing:
         return None
     images = some_of([view.image for view in missing])

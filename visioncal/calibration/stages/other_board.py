@@ -54,12 +54,6 @@ class OtherBoardError(DataError):
         error.finding = finding
         return error
 
-    def within(self, label: str) -> Self:
-        """The same error and finding, with its message prefixed by a file or frame, once."""
-        error = super().within(label)
-        error.finding = self.finding
-        return error
-
 
 def spread(views: Sequence[View], count: int = LOOKED_AT) -> Sequence[View]:
     """A few views from all over a session."""

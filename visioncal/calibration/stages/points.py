@@ -70,10 +70,8 @@ def as_hand_eye(found: Calibration, session: Session) -> Calibration:
     names = edge_names(_mount(session))
     noise = {"combined_translation_mm": found.noise["robot_translation_mm"]}
     findings = tuple(
-        replace(
-            finding,
-            words=_said(finding.words, session),
-            do=finding.do and replace(finding.do, words=_said(finding.do.words, session)),
+        replace(finding, words=_said(finding.words, session)).with_do(
+            lambda do: replace(do, words=_said(do.words, session))
         )
         for finding in found.verdict.findings
     )
@@ -107,10 +105,8 @@ def named(session: Session) -> Iterator[None]:
         yield
     except VisioncalError as error:
         culprits = [_said(culprit, session) for culprit in error.culprits]
-        step = _said(error.next_step, session)
-        raise type(error)(
-            _said(error.message, session), culprits=culprits, next_step=step
-        ) from error
+        message, step = (_said(words, session) for words in (error.message, error.next_step))
+        raise error.but(message, culprits=culprits, next_step=step) from error
 
 
 def _said(words: str, session: Session) -> str:

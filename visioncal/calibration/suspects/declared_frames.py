@@ -13,7 +13,7 @@ from visioncal.calibration.stages.cell import stops_by_view
 from visioncal.calibration.stages.robots import CameraTargetPair
 from visioncal.core.number_format import robot_words
 from visioncal.core.types import MOUNTS, FloatArray
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.core.verdict import Finding, calibrating
 from visioncal.session import frame_name
 from visioncal.session.kinds import is_camera_observation
 from visioncal.vision.pnp import ViewPoses
@@ -52,8 +52,8 @@ def carried(run: RunState) -> Iterator[Finding]:
 
 
 def _declared_elsewhere(frame: str, robot: str, words: str) -> Finding:
-    do = f'Write {frame} = "{frame_name("flange", robot)}" in [frames] of session.toml, '
-    return Finding("misread_poses", words, Remedy(f"{do}and calibrate again.", CALIBRATE))
+    do = f'Write {frame} = "{frame_name("flange", robot)}" in [frames] of session.toml, and'
+    return Finding("misread_poses", words, calibrating(do))
 
 
 def on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:

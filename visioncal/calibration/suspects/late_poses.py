@@ -12,7 +12,7 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import view_words
 from visioncal.core.transforms import distances, robot_part
 from visioncal.core.types import MOUNTS
-from visioncal.core.verdict import Finding, Option, Remedy, mending
+from visioncal.core.verdict import Finding, Option, calibrating, mending
 
 _KIND = "late_poses"
 # Poses are those of the joint angles, and of the flange [m, rad].
@@ -22,9 +22,10 @@ _BY_JOINTS = mending(
     "stands)",
     Option("by-joints"),
 )
-_OF_TIP = Remedy(
-    "Write the poses of these rows anew, by their joint angles and the tool of the other rows, or "
-    "calibrate the other views alone."
+_OF_TIP = calibrating(
+    "Write the poses of these rows anew, by their joint angles and the tool of the other rows, or",
+    "the other views alone.",
+    "",
 )
 
 

@@ -48,6 +48,7 @@ from visioncal.core.verdict import (
     Finding,
     Option,
     Remedy,
+    calibrating,
     mending,
     or_alone,
 )
@@ -63,11 +64,11 @@ _MISREAD_RAD = float(np.deg2rad(3.5))
 _ALIKE_RAD, _PAIRS_IN_PLACE = 0.01, 1.0 / 9.0
 
 # Poses are mirrored only on request: another sign of y would fit as well.
-_MIRRORED = Remedy(
+_MIRRORED = calibrating(
     "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
     "the lens; in a corners.csv, u_px counts to the right and v_px down), write a copy in which "
-    "images and corners are mirrored back, and calibrate it. Only where the robot's frame is "
-    "left-handed, convert with --guess --yes --mirror-poses.",
+    "images and corners are mirrored back, and",
+    "it. Only where the robot's frame is left-handed, convert with --guess --yes --mirror-poses.",
     MEND_IMAGES,
 )
 _LOST_TURNS = Remedy(
@@ -134,7 +135,7 @@ def with_undone(run: RunState) -> RunState:
 
     Of a whole cell, each robot is tested with one camera and one target alone.
     """
-    if run.mount is not None:
+    if run.session.has_one_pair:
         # Each mistake hides the next.
         while (mistake := likeliest(run)) is not None:
             run = undone(run, mistake)
@@ -202,7 +203,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
     Of a whole cell, each robot is tested with one camera and one target alone, those of most views
     first, where their chain does not close.
     """
-    if run.mount is not None:
+    if run.session.has_one_pair:
         yield from _misread_poses(run) if run.readings is None else misread_readings(run)
         return
     for robot in (name for name in run.session.robots if name in run.robots):
@@ -276,8 +277,8 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
         if guess.positions:
             every = tuple(view.number for view in run.session.views)
             option = Option("positions", guess.positions, every)
-            step = mending("positions are read otherwise", option)
-            step = replace(step, words=f"{_WHICH} Where the positions are wrong: {step.words}")
+            write = f"{_WHICH} Where the positions are wrong: Write"
+            step = mending("positions are read otherwise", option, write)
         yield Finding("misread_poses", guess.sentence, step)
     yield from unknown
 

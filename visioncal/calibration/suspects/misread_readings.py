@@ -11,7 +11,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.readings import places_of_one_point
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.core.verdict import Finding, calibrating
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 
 # Mirroring another axis is equivalent, up to half turns of the instrument's frame.
@@ -43,11 +43,11 @@ def misread_readings(run: RunState) -> Iterator[Finding]:
             "The instrument's readings are in a left-handed frame: with one axis mirrored (two "
             f"exchanged, or one of the other sign), they fit the robot's poses to "
             f"{mirrored.figures}; as read, to {as_read.figures}.",
-            Remedy(
+            calibrating(
                 "Look which columns the instrument's program wrote: exchange two of meas_x_m, "
-                "meas_y_m and meas_z_m in views.csv, or negate one, and calibrate again. Either "
-                "gives the same arm; the instrument's frame is the one that it then is.",
-                CALIBRATE,
+                "meas_y_m and meas_z_m in views.csv, or negate one, and",
+                "again. Either gives the same arm; the instrument's frame is the one that it then "
+                "is.",
             ),
         )
     elif run.readings.are_poses:
@@ -65,5 +65,5 @@ def _misread_probe(run: RunState) -> Iterator[Finding]:
     if guess.stands_out:
         words = guess.sentence.replace("camera", "instrument")
         step = "Write meas_x_m to meas_qw (the probe's poses in the instrument's frame, in metres, "
-        step += "quaternion x, y, z, w), or the robot's, so in views.csv, and calibrate again."
-        yield Finding("misread_readings", words, Remedy(step, CALIBRATE))
+        step += "quaternion x, y, z, w), or the robot's, so in views.csv, and"
+        yield Finding("misread_readings", words, calibrating(step))

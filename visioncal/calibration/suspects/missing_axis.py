@@ -11,7 +11,7 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimit
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import robot_part
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.core.verdict import CALIBRATE, Finding, Option, Remedy, mending
+from visioncal.core.verdict import CALIBRATE, Finding, Option, Remedy, calibrating, mending
 from visioncal.estimation.observability import too_little_motion
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 
@@ -59,12 +59,11 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
         f"{figure(1e3 * moved_m)} mm, as where a rail, a gantry or another external "
         "axis moved that is in no pose."
     )
-    do = Remedy(
-        f"In views.csv, add this axis's position to {name}_m of each row (m; or as a column of its "
-        "own, whose motion is then found), or calibrate views at one place of it."
-        if is_axis
-        else "Write poses that contain this axis, or calibrate views at one place of it."
-    )
+    step = "Write poses that contain this axis"
+    if is_axis:
+        step = f"In views.csv, add this axis's position to {name}_m of each row (m; or as a column "
+        step += "of its own, whose motion is then found)"
+    do = calibrating(f"{step}, or", "views at one place of it.", "")
     if is_axis and _is_in_other_order(pairs[:, 0, axis, 3], motion, away_m):
         words = (
             f"The robot's {name} has the numbers of other rows, as where its column was sorted by "
@@ -73,7 +72,8 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
             f"{figure(1e3 * moved_m)} mm."
         )
         step = f"In views.csv, write column {name}_m anew, each number in the row of its own pose."
-        yield Finding("misread_poses", words, Remedy(f"{step} Calibrate again.", CALIBRATE))
+        do = Remedy(f"{step} Calibrate again.", CALIBRATE, of_check=f"{step} Verify again.")
+        yield Finding("misread_poses", words, do)
         return
     by_view = dict(zip(views.tolist(), motion.tolist(), strict=True))
     every = tuple(view.number for view in run.session.views)

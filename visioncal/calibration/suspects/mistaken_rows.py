@@ -47,6 +47,12 @@ class Undoing:
     quarters: int = 0  # By how many the views' pictures are turned clockwise.
 
 
+def left_out(odds: float, short: str, how: Finding) -> Undoing:
+    """A mistake of views that are left out, in short, and a finding on how it is one."""
+    words = f"In {view_words(how.views)} {short}{how.words} They were left out."
+    return Undoing(odds, replace(how, words=words), short)
+
+
 def copied_rows(
     record: Record, edges: Edges, apart: FloatArray, paired: IntArray, agrees: Mask
 ) -> Iterator[Undoing]:
@@ -139,17 +145,9 @@ def other_signs(
             continue
         short = f"{name} of the robot's position has the other sign"
         axes = ",".join(f"-{each}" if each == name else each for each in "xyz")
-        yield Undoing(
-            odds - float(np.log(3.0)),
-            Finding(
-                "lost_sign",
-                f"In {view_words(views)} {short}: with its own, they agree with the others. They "
-                "were left out.",
-                mending("it has its own", Option("positions", axes, views)),
-                views,
-            ),
-            short,
-        )
+        do = mending("it has its own", Option("positions", axes, views))
+        how = Finding("lost_sign", ": with its own, they agree with the others.", do, views)
+        yield left_out(odds - float(np.log(3.0)), short, how)
 
 
 def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[Undoing]:
@@ -174,17 +172,9 @@ def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[U
         subject = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
         short = f"{subject} is {unit} as in the others, as where it is in another unit"
         axes = ",".join(f"{factor:g}*{at}_m" if at in part else at for at in "xyz")
-        yield Undoing(
-            EVIDENCE * float(log - base) + MISTAKE,
-            Finding(
-                "mixed_units",
-                f"In {view_words(views)} {short}: in the same one, they agree with the others. "
-                "They were left out.",
-                mending("all have one unit", Option("positions", axes, views)),
-                views,
-            ),
-            short,
-        )
+        do = mending("all have one unit", Option("positions", axes, views))
+        how = Finding("mixed_units", ": in the same one, they agree with the others.", do, views)
+        yield left_out(EVIDENCE * float(log - base) + MISTAKE, short, how)
 
 
 def _of_changed(record: Record, paired: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
@@ -224,23 +214,13 @@ def mixed_angle_rows(record: Record, paired: IntArray, base: float) -> Iterator[
         rows = wrong[paired] & (paired >= 0)
         views = tuple(record.views[record.rows[rows]].tolist())
         short = "the robot's angles are in radians, and were taken for degrees"
-        words = (
+        do = or_alone(
             "In the log, write their angles in degrees (times 57.29578) as the others' are, and "
+            "convert it anew; or calibrate the other views alone.",
+            record.views[record.rows[~rows]].tolist(),
         )
-        yield Undoing(
-            EVIDENCE * float(log - base) + MISTAKE,
-            Finding(
-                "mixed_units",
-                f"In {view_words(views)} {short}: in the same unit, they agree with the others. "
-                "They were left out.",
-                or_alone(
-                    f"{words}convert it anew; or calibrate the other views alone.",
-                    record.views[record.rows[~rows]].tolist(),
-                ),
-                views,
-            ),
-            short,
-        )
+        how = Finding("mixed_units", ": in the same unit, they agree with the others.", do, views)
+        yield left_out(EVIDENCE * float(log - base) + MISTAKE, short, how)
 
 
 def turned_rows(
@@ -282,16 +262,8 @@ def turned_rows(
         if not degrees:
             short, where = "the board's corners are numbered some squares on", "by"
             back = "they have their own numbers"
-        yield Undoing(
-            odds,
-            Finding(
-                "turned_board",
-                f"In {view_words(views)} {short} {where} {point}. They were left out.",
-                mending(back, Option("turned", about, views)),
-                views,
-            ),
-            short,
-        )
+        do = mending(back, Option("turned", about, views))
+        yield left_out(odds, short, Finding("turned_board", f" {where} {point}.", do, views))
 
 
 def _is_reading(record: Record, turn: FloatArray, lever: float) -> bool:

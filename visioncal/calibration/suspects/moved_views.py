@@ -149,7 +149,7 @@ def _end_run(cell_fit: CellFit) -> _EndRun:
 
 def views_apart(cell_fit: CellFit) -> frozenset[int]:
     """Views of one end of the session of which camera, target or a frame was another one."""
-    if cell_fit.cell.mount is None or cell_fit.inlier_fit.used.all():
+    if not cell_fit.cell.session.has_one_pair or cell_fit.inlier_fit.used.all():
         return frozenset()
     run = _end_run(cell_fit)
     if run.change is None:
@@ -291,8 +291,8 @@ def without_tool(tool: FloatArray, views: Sequence[int], otherwise: str) -> Reme
     twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
     numbers = ",".join(f"{value:.4f}" for value in twist)
     option = Option("without-tool", numbers, tuple(views), tool)
-    first = "Look whether a tool was active there. If so, "
-    return mending("it is taken off their poses", option, first, f". Else {otherwise}")
+    write = "Look whether a tool was active there. If so, write"
+    return mending("it is taken off their poses", option, write, f". Else {otherwise}")
 
 
 def turned_back(board: Target, views: Sequence[int]) -> Remedy:

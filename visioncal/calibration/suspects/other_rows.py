@@ -15,7 +15,7 @@ from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import counted, listed
 from visioncal.core.transforms import compose, robot_part
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.core.verdict import Finding, calibrating
 
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 # Position by axis, and rotation; all four together are rows that are apart.
@@ -74,10 +74,9 @@ def of_other_rows(run: RunState, rival_score: float) -> Iterator[Finding]:
         f"In views.csv, the numbers of {names} stand {apart} {stand} than the others of their "
         f"pose, as where cells were pasted into other rows: moved, robot and camera agree to "
         f"{best.figures}; as first read, to {first.figures}.",
-        Remedy(
+        calibrating(
             f"In views.csv, move the cells of {names} {where} by {apart}, delete the rows that "
-            "have none then, and calibrate again.",
-            CALIBRATE,
+            "have none then, and"
         ),
     )
 

@@ -101,7 +101,7 @@ def explained_outliers(
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
     faults += _turned(cell_fit, outliers) if not faults else ()
-    is_pair = cell_fit.cell.mount is not None
+    is_pair = session.has_one_pair
     if not faults and (not is_pair or len(session.boards) > 1):
         faults += _misnamed(cell_fit, outliers)
     if not faults:
@@ -173,7 +173,8 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
     if in_turn := [circle for circle in circles if len(circle) > 2]:
         yield _exchanged_in_turn(cell_fit, in_turn)
     pairs = sorted((a, b) for a, b, *others in circles if not others)
-    for robot, flange in problem.tree.flanges.items() if cell_fit.cell.mount is None else ():
+    flanges = {} if cell_fit.cell.session.has_one_pair else problem.tree.flanges
+    for robot, flange in flanges.items():
         by_robot = np.flatnonzero(problem.observations_through(flange)).tolist()
         through = [pair for pair in pairs if pair[0] in by_robot]
         by_stops = Counter(tuple(sorted(rows[at].station for at in pair)) for pair in through)
@@ -258,7 +259,7 @@ def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:
 
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, str], frozenset[int]]:
     """Why outliers are left out, by view, given the likely cause of each; and the marginal ones."""
-    inliers, is_single = cell_fit.inlier_fit, cell_fit.cell.mount is not None
+    inliers, is_single = cell_fit.inlier_fit, cell_fit.cell.session.has_one_pair
     directions = np.maximum(inliers.distances.directions, 1)
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)

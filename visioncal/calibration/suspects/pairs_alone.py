@@ -76,7 +76,7 @@ class PairAlone:
 def is_open(run: RunState) -> bool:
     """Whether a cell's verdict leaves open what a pair of it may show alone."""
     verdict = run.verdict
-    if run.mount is not None or verdict is None or verdict.status == "good":
+    if verdict is None or verdict.status == "good":
         return False
     kind = next((cause.kind for cause in verdict.causes), "")
     knocked = _knocked(run) if kind == "moved_frame" else ()
@@ -94,7 +94,7 @@ def pairs_alone(run: RunState, calibrated: PairRun) -> list[PairAlone]:
     """The pairs of a cell that give a result by themselves, those of most views first."""
     every = [
         (robot, pair)
-        for robot in run.session.robots
+        for robot in (() if run.session.has_one_pair else run.session.robots)
         for pair in pairs_of(run, robot)
         if len(pair.poses) >= FEWEST_ROWS
     ]

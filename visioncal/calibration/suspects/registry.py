@@ -42,7 +42,7 @@ def _outliers(run: RunState) -> Iterator[Finding]:
     held_out = left_out_rms(run.assessment.views)
     for fault in run.assessment.faults:
         yield replace(fault.found, without_it=without(fault.found.views, held_out.words))
-    if run.mount is None:
+    if not run.session.has_one_pair:
         yield from moved_findings(run.assessment.moved, run.assessment.edges, run.cell_fit)
         yield from crept_findings(run.cell_fit)
 
@@ -54,7 +54,7 @@ def _contradicted(run: RunState) -> Iterator[Finding]:
 
 def _unconnected(run: RunState) -> Iterator[Finding]:
     for frame in run.cell_fit.unconnected:
-        if run.mount is not None and frame.startswith("target"):
+        if run.session.has_one_pair and frame.startswith("target"):
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
             step = Remedy("Add views that show it, or delete it from session.toml.")
             yield Finding("unseen_target", words, step)

@@ -70,7 +70,8 @@ def _found(run: RunState) -> Iterator[Finding]:
 
 def _of_tool(run: RunState, step: Step, do: str) -> Remedy | None:
     """Advice to take a tool off the poses after a step, or to `do` something; None for no tool."""
-    if step.kind != FRAME or step.earlier or run.mount is None or not is_switched(exp(step.value)):
+    is_one_step = run.session.has_one_pair and step.kind == FRAME and not step.earlier
+    if not (is_one_step and is_switched(exp(step.value))):
         return None
     later = run.cell_fit.cell.views_from(step.stop)
     otherwise = f"{do[0].lower()}{do[1:]}, and record again; or calibrate the {len(later)} views "
@@ -112,7 +113,7 @@ def _words(step: Step, run: RunState) -> str:
             f"before, by the robot's motion{source}"
         )
     far_mm, far_deg = pose_difference(np.eye(4), exp(step.value))
-    is_far = run.mount is not None and step.kind == FRAME and far_mm > _LIMITS.arm_errors[0]
+    is_far = run.session.has_one_pair and step.kind == FRAME and far_mm > _LIMITS.arm_errors[0]
     if is_far:
         # A step that is far was linearised at a fit that is far from either part.
         before, after = _edges(run, step)
@@ -123,10 +124,9 @@ def _words(step: Step, run: RunState) -> str:
             "Residuals drift with time: from the first stop to the last, base or target moved by "
             f"{moved}, or the arm grew as it warmed up"
         )
-    mount = run.mount
-    on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")
+    on_flange = (run.mount == "eye-in-hand") == step.of.startswith("cam")
     # Things beside a robot move relative to its base.
-    of_base = "" if mount is None or on_flange else ", or the robot's base,"
+    of_base = "" if on_flange or not run.session.has_one_pair else ", or the robot's base,"
     words, since = f"{thing}{of_base} moved at once: ", "it was"
     for one in step.earlier:
         by = mm_and_deg(*pose_difference(np.eye(4), exp(one.value)))

@@ -15,7 +15,7 @@ from visioncal.vision.targets import rotation_transforms
 
 def _found(run: RunState) -> Iterator[Finding]:
     """Views whose pose is that of the board turned, which the fit took."""
-    if run.mount is None or not run.session.boards:
+    if not (run.session.has_one_pair and run.session.boards):
         return
     (board, *others) = run.session.boards.values()
     given = {view.number for view in run.session.views if view.has_corners}

@@ -31,6 +31,7 @@ from visioncal.calibration.suspects.mistaken_rows import (
     Undoing,
     chosen_views,
     copied_rows,
+    left_out,
     mixed_angle_rows,
     mixed_unit_rows,
     other_signs,
@@ -70,7 +71,7 @@ def likeliest(run: RunState, stops: Mapping[int, StopOfRobot] | None = None) -> 
     Of one robot and one camera whose poses stand beside their images, after the stage `pnp`; of a
     pair in a whole cell, rows are counted by all `stops` of the robot.
     """
-    if run.mount is None or run.misread or waits_for_clock(run.session):
+    if not run.session.has_one_pair or run.misread or waits_for_clock(run.session):
         return None
     record = Record.of(run, stops)
     if len(record.rows) < FEWEST_COMPARED:
@@ -148,21 +149,13 @@ def _flipped(
         return
     others = record.views[record.rows[~wrong]].tolist()
     short = "the board's pose is the other one of the two that a flat board's image nearly fits"
-    yield Undoing(
-        odds,
-        Finding(
-            "flipped_poses",
-            f"In {view_words(views)} {short}: tilted the other way about the line "
-            "of sight. They were left out.",
-            or_alone(
-                "Have the detector give both poses and take the other one in these views (OpenCV: "
-                "solvePnPGeneric), or give images or corners; or calibrate the other views alone.",
-                others,
-            ),
-            views,
-        ),
-        short,
+    do = or_alone(
+        "Have the detector give both poses and take the other one in these views (OpenCV: "
+        "solvePnPGeneric), or give images or corners; or calibrate the other views alone.",
+        others,
     )
+    how = ": tilted the other way about the line of sight."
+    yield left_out(odds, short, Finding("flipped_poses", how, do, views))
 
 
 def _turned_pictures(

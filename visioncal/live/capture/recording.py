@@ -222,8 +222,7 @@ class Capture:
                     next_step=resume,
                 ) from None
             step = f"{error.next_step} {resume}".strip()
-            message = f"{error.message} {stored}"
-            raise type(error)(message, culprits=error.culprits, next_step=step) from error
+            raise error.but(f"{error.message} {stored}", next_step=step) from error
 
     @contextmanager
     def until(self, end: type[BaseException]) -> Iterator[None]:

@@ -19,7 +19,7 @@ from visioncal.present.recording.rrd_messages import (
     record_batch,
     scan,
 )
-from visioncal.session.images import ImageStore
+from visioncal.session.images import MISSING, ImageStore
 from visioncal.session.streams import Stream
 
 _AGAIN = "Take the recording again from its origin, or calibrate the session's folder."
@@ -174,7 +174,7 @@ class RecordedImages(ImageStore):
         if path in self.depths:
             return ""
         if path not in self.digests:
-            return "is missing"
+            return MISSING
         if self.kept == "full":
             return ""
         return f"is not in {self.path.name}, which was written with --images {self.kept}"
