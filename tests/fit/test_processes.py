@@ -118,6 +118,24 @@ def test_views_that_agreed_with_no_half_come_back_with_another_size_of_the_board
     assert fit.state.values["shape", "target"][0] == pytest.approx(0.2, abs=3e-3)
 
 
+def test_a_trial_of_another_size_that_does_not_come_to_rest_begins_with_less_noise(monkeypatch):
+    small = made(3, stops=12)
+    start = start_of(with_board(small.cell, 0.04 / 1.2, 1e-3))
+    search = Search.of(start.cell, unknowns_of(start, ()), start.sound)
+    some = search._sized(state_of(start, ()), np.arange(12) < 7, None)
+    run = Search.run
+
+    def diverges(search, state, used, known=None):
+        if known is not None and known.used.all():
+            raise np.linalg.LinAlgError
+        return run(search, state, used, known)
+
+    monkeypatch.setattr(Search, "run", diverges)
+    _, fit, _ = _explained(search, some, some.left_out())
+    assert fit.used.all()
+    assert fit.state.values["shape", "target"][0] == pytest.approx(0.2, abs=3e-3)
+
+
 def with_board(cell, square_m, share):
     board = replace(cell.boards["target"], square_m=square_m, square_sigma_m=share * square_m)
     return replace(cell, boards={"target": board})

@@ -2123,6 +2123,24 @@ def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(t
     assert 'tip = "d"' in (tmp_path / "other/session.toml").read_text()
 
 
+def test_a_tip_of_no_usual_name_is_that_of_the_arm_that_is_named(tmp_path):
+    """As of makers that call the flange after the last link."""
+    rows = np.random.default_rng(3).uniform(-1.0, 1.0, (9, 10)).round(6)
+    rows[:, -4:] /= np.linalg.norm(rows[:, -4:], axis=1, keepdims=True)
+    header = [
+        *of_urdf().joint_names,
+        *(f"cam_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")),
+    ]
+    log, arm = tmp_path / "in/log.csv", tmp_path / "arm.urdf"
+    log.parent.mkdir()
+    write_table(log, header, rows)
+    write(arm, URDF.replace('"flange"', '"arm_link8"'))
+    said = ("--mount", "eye-in-hand", "--robot-model", arm)
+    visioncal("convert", log, tmp_path / "out", *said).refused("no tool0 or flange", "--tip")
+    visioncal("convert", log, tmp_path / "out", *said, "--tip", "arm_link8").good()
+    assert Session.load(tmp_path / "out").views[0].joints_rad == pytest.approx(rows[0, :3])
+
+
 @pytest.mark.slow
 def test_images_are_searched_once_where_few_rows_decide_nothing(tmp_path, monkeypatch):
     session = world()[2]

@@ -127,11 +127,17 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
     whole = search.with_all(fit)
     links = [effect.name for effect in search.unknowns.effects if isinstance(effect, Links)]
     wider = [opened(whole, search.pairs, of_stops(whole, search.pairs))]
-    wider += [(with_free_boards(fit), fit.state)] if held_boards(fit) else []
     tried = [(*one, whole) for one in wider if one is not None]
+    if held_boards(fit):
+        # By the noise of all, which another size inflates, or of those that agree without it.
+        tried += [(with_free_boards(fit), fit.state, known) for known in (whole, fit)]
     for unknowns, state, known in (*[(search.unknowns, fit.state, None)] * bool(links), *tried):
         other = search.with_unknowns(unknowns)
-        found, left = other.run(state, search.sound, known)
+        try:
+            found, left = other.run(state, search.sound, known)
+        except np.linalg.LinAlgError:
+            # A trial that does not come to rest explains nothing.
+            continue
         # With more noise anything agrees, and with links that are far off.
         before, after = _levels(fit), _levels(found)
         is_noise = any(after[name] > 2.0 * level for name, level in before.items())

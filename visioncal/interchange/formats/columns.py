@@ -300,7 +300,7 @@ def _joint_angles(
         return None, [f"The joint angles are left aside: {error.message}"]
     if requested.robot_model is None or len(names) > 1:
         return joints, [*notes]
-    robot = Robot.from_document(read_robot_document(requested.robot_model))
+    robot = Robot.from_document(read_robot_document(requested.robot_model, tip=requested.tip))
     count, arm = joints.shape[1], robot.joint_count
     if arm < count <= arm + _FINGERS:
         note = f"Of {count} joint angles a row the first {arm} are taken: {robot.name} has {arm}, "

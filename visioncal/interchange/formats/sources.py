@@ -326,7 +326,7 @@ def _with_joints(fields: Fields, requested: ImportOptions) -> ImportOptions:
         return requested
     if requested.robot_model is None:
         return _of_urdf(fields, requested)
-    robot = Robot.from_document(read_robot_document(requested.robot_model))
+    robot = Robot.from_document(read_robot_document(requested.robot_model, tip=requested.tip))
     if called := joint_names(fields, (), robot.joint_names):
         return replace(requested, joints=called)
     count = robot.joint_count
