@@ -10,7 +10,8 @@ from test_undone import poses_of
 
 from visioncal.calibration.pipeline.explaining import explained
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.run import Stage, run_stages
+from visioncal.calibration.run import STAGES, Stage, run_stages
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.moved_views import without_tool
 from visioncal.calibration.suspects.pairs_alone import PairAlone, found_alone, of_all_rows
 from visioncal.cli.summary import _not_in_verdict
@@ -168,3 +169,23 @@ def test_views_whose_one_reason_a_finding_states_are_not_listed_again():
 
 def _left_out(view: int, reason: str) -> ViewResult:
     return ViewResult(view, used=False, reason=reason)
+
+
+def test_a_model_that_cannot_be_read_is_known_by_its_place_in_the_session():
+    session = pairs_session(MOUNTS[0], *poses_of(MOUNTS[0]))
+    other = session.with_content(document={**session.document, "robot": {"model": "kuka"}})
+    (unread,) = other.unread_models
+    assert unread in other.warnings
+    found = {at.words: at.kind for at in run_stages(RunState(other), STAGES[:1]).warnings}
+    assert found[unread] == "misread_joints"
+
+
+def test_an_error_has_copies_with_other_parts():
+    error = OtherBoardError.of(Finding("other_board", "It is another.", Remedy("Look.")))
+    copied = error.but(culprits=["view 3"])
+    assert copied.finding is error.finding
+    assert str(copied) == "It is another. Look."
+    assert copied.culprits == ("view 3",)
+    assert not copied.but(next_step="").next_step
+    assert copied.within("board").within("board").message == "board: It is another."
+    assert copied.but("Another.").next_step == "Look."

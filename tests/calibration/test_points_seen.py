@@ -12,6 +12,7 @@ from support.marks import seeds, slow
 from support.refusals import raised
 
 import visioncal as package
+from visioncal.calibration.stages.points import named
 from visioncal.core.errors import DegenerateError
 
 BALL = Path(__file__).parents[3] / "shared/data/field/cases/ball-points/ball.csv"
@@ -47,6 +48,16 @@ def test_a_motion_about_one_axis_is_refused_in_the_words_of_the_camera():
     said = f"{refused} {refused.next_step}"
     assert "instrument" not in said
     assert "[prior.base_from_target]" in said
+
+
+def test_a_sessions_own_name_and_its_paths_are_not_the_cameras():
+    session = session_of(1, "eye-in-hand")
+    said = "session 'probe': the instrument's base/views.csv has no probe."
+    with pytest.raises(DegenerateError) as caught, named(session):
+        raise DegenerateError(said, culprits=["base/views.csv"], next_step="Turn the base.")
+    assert caught.value.message == "session 'probe': the camera's base/views.csv has no point."
+    assert caught.value.culprits == ("base/views.csv",)
+    assert caught.value.next_step == "Turn the tool."
 
 
 def test_rows_without_points_are_refused():

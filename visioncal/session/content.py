@@ -68,6 +68,7 @@ class SessionContent:
     # Corners by another detector; None where there are none.
     corner_table: CornerTable | None = None
     notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
+    unread_models: tuple[str, ...] = ()  # The warnings that are of robots' models.
 
     @classmethod
     def assemble(
@@ -150,6 +151,7 @@ class SessionContent:
             several,
             corner_table=corners,
             notes=tuple(outside_notes(declaration, folder)),
+            unread_models=tuple(problems),
         )
         if corners is not None:
             seen = (view for view in views if view.has_corners)

@@ -37,7 +37,7 @@ def session_text(path: Path) -> str:
             siblings = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
             found += [siblings[name] for name in get_close_matches(path.name, siblings, 1, 0.8)]
         near = next((file.parent for file in found if file.is_file()), None)
-        if near is None and not (path.exists() and error.message.endswith("does not exist.")):
+        if near is None and (not path.exists() or (path / "session.toml").exists()):
             raise
         step = (
             f"Name the session's folder: {shlex.quote(str(near))}"

@@ -1,6 +1,5 @@
 """Reads what a session has of robots, instruments and clocks: the stages before the fit."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -29,8 +28,6 @@ from visioncal.session import STREAMS, Session
 from visioncal.session.columns import column_warnings
 from visioncal.session.table import check_two_sides
 
-# Place that warnings about the robot's model begin with.
-_OF_MODEL = re.compile(r"session\.toml: robots?\.(\w+\.)?model: ")
 _OF_ONE = (
     "Write the robot's own poses into x_m to qw of views.csv, or the camera's into cft_x_m to "
     "cft_qw; or convert the source again, with the fields or the file of each named."
@@ -96,7 +93,7 @@ def _suspicious(session: Session) -> Iterator[Finding]:
     # A column that may be misspelt, or the user's own.
     of_columns = [*column_warnings(session.columns)]
     for warning in session.warnings:
-        if _OF_MODEL.match(warning):
+        if warning in session.unread_models:
             yield Finding("misread_joints", warning, Remedy(_MODEL_STEP))
         elif warning in of_columns:
             yield Finding(NOTE, warning)
@@ -115,7 +112,7 @@ def _reported(run: RunState) -> RunState:
     if matched is not None and matched.misread:
         check_level_is_possible(run.level, can=False, misread=matched.misread)
     if not run.base_from_flange:
-        of_model = [warning for warning in session.warnings if _OF_MODEL.match(warning)]
+        of_model = session.unread_models
         step = _MODEL_STEP if of_model else " ".join(session.warnings)
         raise DataError(
             " ".join([*of_model, f"session {session.name!r}: no view has a pose of the robot."]),

@@ -110,10 +110,13 @@ def named(session: Session) -> Iterator[None]:
 
 
 def _said(words: str, session: Session) -> str:
-    """A sentence about the instrument as one about the camera, with base and tool exchanged."""
+    """A sentence about the instrument as one about the camera, with base and tool exchanged.
+
+    Names in quotes and parts of paths stay, whatever they are.
+    """
     said = dict(zip(_EDGES, edge_names(_mount(session)), strict=True)) | {"instrument": "camera"}
     said |= {"probe": "point", "tracker": "sensor"}
     if _mount(session) == "eye-in-hand":
         said |= {"base": "tool", "tool": "base"}
-    pattern = "|".join(rf"\b{word}\b" for word in said)
+    pattern = rf"(?<![\w/'\"])(?:{'|'.join(said)})(?![\w/])"
     return re.sub(pattern, lambda found: said[found[0]], words)
