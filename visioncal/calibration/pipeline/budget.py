@@ -47,8 +47,10 @@ def left_out(cell_fit: CellFit) -> HeldOutResiduals:
                 continue
             state = (
                 solve_without(part, fit, kept)
-                if cell_fit.solver == "joint" or mount is None
-                else closed_form_state(part.subset(kept), cell_fit.solver, fit.state, mount)
+                if cell_fit.solver == "joint"
+                else closed_form_state(
+                    part.subset(kept), cell_fit.solver, fit.state, cell_fit.cell.session.mount
+                )
             )
             predicted = part.predicted(state)
             off_m, off_rad = pose_residuals(part, state, predicted)

@@ -105,9 +105,9 @@ def _is_by_lens(run: RunState, worst: Sequence[Direction]) -> bool:
     fit = run.assessment.fit
     lens = fit.unknowns.of_kinds(LENS)
     is_estimated = any(look.table.stated is None for look in run.cameras.values())
-    if run.mount is None or not (is_estimated and len(lens)):
+    if not (run.session.has_one_pair and is_estimated and len(lens)):
         return False
-    inner, names = fit.whole[np.ix_(lens, lens)], chain_words(fit.problem, run.mount).names
+    inner, names = fit.whole[np.ix_(lens, lens)], chain_words(fit.problem, run.session.mount).names
     known = fit.whole - fit.whole[:, lens] @ np.linalg.pinv(inner, hermitian=True) @ fit.whole[lens]
     given_lens = [found for _, found in directions(fit.problem, fit.state, known, names)]
     at = max(range(len(worst)), key=lambda at: worst[at].sigma / worst[at].limit)
@@ -315,9 +315,10 @@ def _arms(run: RunState) -> list[JudgedArm]:
 
 def poor_motion(run: RunState) -> Finding | None:
     """Finding that the motion of one robot is too poor for one camera; None for a whole cell."""
-    if run.mount is None or len(run.base_from_flange) < 2:
+    if not run.session.has_one_pair or len(run.base_from_flange) < 2:
         return None
-    words, advice = too_little_motion(np.array([*run.base_from_flange.values()]), run.mount)
+    poses = np.array([*run.base_from_flange.values()])
+    words, advice = too_little_motion(poses, run.session.mount)
     return Finding("weak_motion", words, Remedy(advice)) if words else None
 
 
@@ -341,8 +342,8 @@ def check_answer(run: RunState) -> None:
 
 def words_of(cell: Cell, part: Problem, *, can_tilt: bool | None = None) -> CellWords:
     """The fault of a motion that leaves a frame undetermined, and its remedy."""
-    if cell.mount is not None:
-        return chain_words(part, cell.mount, can_tilt=can_tilt)
+    if cell.session.has_one_pair:
+        return chain_words(part, cell.session.mount, can_tilt=can_tilt)
 
     def advice(frame: str, _: str) -> str:
         frame = frame.partition("@")[0]

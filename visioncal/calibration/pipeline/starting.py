@@ -16,7 +16,7 @@ from visioncal.calibration.stages.error_sizes import scales_of, session_start
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.limits import CLEAR_RATIO
-from visioncal.core.types import FloatArray, Mask, Target
+from visioncal.core.types import MOUNTS, FloatArray, Mask, Target
 from visioncal.estimation.observability import refuse_too_few
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
@@ -82,8 +82,8 @@ def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
         raise nothing_seen(observed)
     views = [observed.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
-    if cell.mount is not None:
-        refuse_too_few(problem, cell.mount)
+    if cell.session.has_one_pair:
+        refuse_too_few(problem, cell.session.mount)
     begun = session_start(observed, cell.reference, has_priors=bool(cell.priors))
     solved = None
     # Where it does not come to rest, the fit of poses says why.
@@ -199,7 +199,7 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     covariance[is_given] = _NOMINAL
     oriented = {row.seen for row in cell.rows if not row.is_place}
     # Of poses without a stated noise, that of one camera and one robot is estimated as one.
-    is_combined = cell.mount is not None and cell.mount != "instrument" and bool(is_given.any())
+    is_combined = cell.mount in MOUNTS and bool(is_given.any())
     is_uneven = is_given & [not row.seer.startswith("instrument") for row in cell.rows]
     if is_combined:
         is_uneven |= True

@@ -125,7 +125,8 @@ def with_misreading(run: RunState) -> RunState:
 def with_open_chains(run: RunState) -> RunState:
     """Looks for misread poses before the fit where chains do not close; notes turned boards."""
     run = with_undone(run)
-    if run.mount is None or not closes(run.base_from_flange, run.poses_of_one_board, run.mount):
+    poses, boards = run.base_from_flange, run.poses_of_one_board
+    if not (run.session.has_one_pair and closes(poses, boards, run.session.mount)):
         run = with_misreading(run)
     return run if run.misread else run.noting((), turned_boards(run))
 

@@ -37,12 +37,12 @@ def missing_axes(run: RunState, views: IntArray, pairs: FloatArray) -> Iterator[
         views: (m,) numbers of the views that have both poses.
         pairs: (m, 2, 4, 4) poses of the robot, and of the target by each image alone.
     """
-    if run.mount is None or len(views) <= FEWEST_COMPARED:
+    if not run.session.has_one_pair or len(views) <= FEWEST_COMPARED:
         return
     # Without turns, positions alone leave a line open that no axis moved along.
-    if too_little_motion(pairs[:, 0], run.mount)[0]:
+    if too_little_motion(pairs[:, 0], run.session.mount)[0]:
         return
-    direction, motion, away_m, angles = _line(pairs, run.mount)
+    direction, motion, away_m, angles = _line(pairs, run.session.mount)
     # Across the line, no more is left than an arm errs by; along it, more moved than one thing
     # once, or than a few views.
     limits, moved_m = CalibrationLimits().arm_errors, float(np.ptp(motion))

@@ -14,7 +14,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import counted, listed
 from visioncal.core.transforms import compose, robot_part
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import MOUNTS, FloatArray, IntArray
 from visioncal.core.verdict import Finding, calibrating
 
 _SHIFTS = (1, -1, 2, -2, 3, -3)
@@ -28,7 +28,7 @@ def of_other_rows(run: RunState, rival_score: float) -> Iterator[Finding]:
 
     The chain closes clearly better by these than by another reading, whose score is `rival_score`.
     """
-    if run.mount is None or run.mount == "instrument":
+    if run.mount not in MOUNTS:
         return
     seen = alike_turning(run.base_from_flange, run.poses_of_one_board, run.mount)
     views = [view.number for view in run.session.views]
@@ -46,7 +46,7 @@ def of_other_rows(run: RunState, rival_score: float) -> Iterator[Finding]:
         # A row has no other one, whichever of its columns are moved.
         is_complete = np.isfinite(moved).all(axis=(0, 2, 3))
         if is_complete.sum() > FEWEST_ROWS:
-            robot = robot_part(moved[:, is_complete], run.mount or "eye-in-hand")
+            robot = robot_part(moved[:, is_complete], run.session.mount)
             fits = robust_fits(robot, np.broadcast_to(camera[is_complete], robot.shape), STARTS)
             for fit, parts in zip(fits, choices, strict=True):
                 yield replace(fit, lost=int(np.sum(~is_complete))), parts, by
