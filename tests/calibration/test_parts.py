@@ -29,7 +29,7 @@ from visioncal.core.verdict import (
     mending,
     with_paths,
 )
-from visioncal.results import ViewResult
+from visioncal.results import CONTRADICTS, ViewResult
 from visioncal.simulation import NetworkOptions, cell_session, simulate
 from visioncal.verification.misreading import misreading
 
@@ -165,6 +165,12 @@ def test_views_whose_one_reason_a_finding_states_are_not_listed_again():
     assert [*_not_in_verdict(verdict, views)] == views
     alike = [_left_out(3, "disagrees"), _left_out(4, "disagrees")]
     assert not [*_not_in_verdict(verdict, alike)]
+
+
+def test_a_view_contradicts_the_others_by_its_reason_alone():
+    assert _left_out(3, f"{CONTRADICTS}the others: blurred").contradicts
+    assert not _left_out(3, f"blurred, and {CONTRADICTS}the others").contradicts
+    assert not ViewResult(3, used=True, reason=CONTRADICTS).contradicts
 
 
 def _left_out(view: int, reason: str) -> ViewResult:

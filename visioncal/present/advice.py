@@ -11,8 +11,6 @@ from visioncal.results import Calibration, ViewResult
 
 # A used view is listed if its residual exceeds this many medians, as in the verdict.
 _OUTLIER_FACTOR = CalibrationLimits.outlier
-# Prefix of the reason of a view that was left out because pose and image are inconsistent.
-_CONTRADICTION_PREFIX = "disagrees with "
 
 # At most this many views are listed by number.
 _MOST_LISTED = 12
@@ -27,11 +25,7 @@ class FlaggedViews:
     why: str  # The finding, in words.
     # The observing and the observed frame, as `cam_top of target`; empty for one camera.
     of: str = ""
-
-    @property
-    def contradict(self) -> bool:
-        """Whether they were left out because they contradict the other views."""
-        return not self.used and self.why.startswith(_CONTRADICTION_PREFIX)
+    contradict: bool = False  # Whether they were left out because they contradict the other views.
 
     @property
     def words(self) -> str:
@@ -59,21 +53,17 @@ def suspects(calibration: Calibration) -> tuple[FlaggedViews, ...]:
 
 def left_out(views: Iterable[ViewResult]) -> Iterator[FlaggedViews]:
     """Views that were not used, grouped by reason."""
-    by_reason: dict[tuple[str, str], list[int]] = {}
+    by_reason: dict[tuple[str, str], list[ViewResult]] = {}
     for view in views:
         if not view.used:
-            by_reason.setdefault((_pair_words(view), view.reason), []).append(view.view)
-    for (of, why), numbers in by_reason.items():
-        yield FlaggedViews(tuple(numbers), used=False, why=why, of=of)
+            by_reason.setdefault((_pair_words(view), view.reason), []).append(view)
+    for (of, why), alike in by_reason.items():
+        numbers = tuple(view.view for view in alike)
+        yield FlaggedViews(numbers, False, why, of, contradict=alike[0].contradicts)
 
 
 def _pair_words(view: ViewResult) -> str:
     return f"{view.seer} of {view.seen}" if view.seer else ""
-
-
-def contradicts(view: ViewResult) -> bool:
-    """Whether a view was left out because it contradicts the others."""
-    return not view.used and view.reason.startswith(_CONTRADICTION_PREFIX)
 
 
 def named(view: ViewResult) -> str:

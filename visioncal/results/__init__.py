@@ -9,4 +9,4 @@ from visioncal.results.lens import CameraResult
 from visioncal.results.parts import NeedMet, Picker, RobotResult, SolverResult
 from visioncal.results.picking import select_matching
 from visioncal.results.result import Calibration
-from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
+from visioncal.results.views import CONTRADICTS, HELD_BACK, Rms, Validation, ViewResult

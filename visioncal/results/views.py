@@ -12,6 +12,8 @@ from visioncal.session.frames import frame_of_object, frames_of_kind, object_nam
 
 # Reason of a view with the role holdout.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
+# Begins the reason of a view that was left out because pose and image are inconsistent.
+CONTRADICTS = "disagrees with "
 _NOT_LEFT_OUT = "none was left out: the residuals of the whole cell's fit"
 # Kinds of observers and of observed frames.
 _KINDS = ("camera", "instrument", "target", "point")
@@ -59,6 +61,11 @@ class ViewResult:
     left_out_mm: float | None = None
     left_out_deg: float | None = None  # The same in rotation [deg].
     left_out_px: float | None = None  # Reprojection error by that fit [px].
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it was left out because it contradicts the others."""
+        return not self.used and self.reason.startswith(CONTRADICTS)
 
     @property
     def of_pair(self) -> "ViewResult":

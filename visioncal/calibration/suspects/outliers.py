@@ -22,7 +22,7 @@ from visioncal.core.number_format import figure, listed, some_of, view_words
 from visioncal.core.transforms import distances, invert, pose_difference
 from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Option, Remedy, mending
-from visioncal.results import Moved
+from visioncal.results import CONTRADICTS, Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import object_name
 from visioncal.vision.targets import half_turn_of, rotation_transforms
@@ -282,7 +282,7 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, st
         if may_err and distance[at] < _MARGIN * limit[at]:
             marginal.add(row.view)
         reasons[row.view] = (
-            f"disagrees with the other views: it places {target} {figure(mm)} mm{turned} away, "
+            f"{CONTRADICTS}the other views: it places {target} {figure(mm)} mm{turned} away, "
             f"{beyond}; {cause}{', or the arm errs so there' if may_err else ''}"
         )
     rows = cell_fit.cell.rows

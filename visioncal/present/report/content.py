@@ -14,7 +14,6 @@ from visioncal.core.number_format import (
 )
 from visioncal.core.types import FloatArray
 from visioncal.present import result_parts
-from visioncal.present.advice import contradicts
 from visioncal.present.facts import DEGREE, PLUS_MINUS, answering_solver, frame_words, of
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
@@ -185,7 +184,7 @@ def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
     for view in calibration.views:
         figures = (view.rms_px, view.residual_mm, view.residual_deg)
         corners = significant(None) if view.corners is None else str(view.corners)
-        mark = "left-out" if contradicts(view) else "rejected"
+        mark = "left-out" if view.contradicts else "rejected"
         mark = ("look" if view.view in outlying else "used") if view.used else mark
         names = (str(view.view), view.seer, view.seen)
         cells = (*names, corners, *map(significant, figures), words[mark])

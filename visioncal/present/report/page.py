@@ -154,7 +154,7 @@ def _pictures(
             session,
             view,
             f"View {named(view)}: {view.reason}",
-            seen.get(view.view) if advice.contradicts(view) else None,
+            seen.get(view.view) if view.contradicts else None,
             1,
         )
         for view in calibration.views

@@ -14,7 +14,6 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Camera, FloatArray
-from visioncal.present.advice import contradicts
 from visioncal.present.cell_poses import CellPoses
 from visioncal.present.coverage import coverage_charts
 from visioncal.results import Calibration, ViewResult
@@ -177,7 +176,7 @@ def _draw_views(
     drawing, places = panel.drawing, _places(len(views))
     bars: dict[str, str] = {}
     for view, x, value in zip(views, places, values, strict=True):
-        left_out = "bad" if contradicts(view) else "muted"
+        left_out = "bad" if view.contradicts else "muted"
         colour = ("check" if view.view in outlying else "accent") if view.used else left_out
         height = min(np.nan_to_num(value), panel.high)
         bars[colour] = bars.get(colour, "") + f"M{x:.1f} {panel.y(0.0):.1f}V{panel.y(height):.1f}"
