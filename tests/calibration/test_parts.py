@@ -195,3 +195,17 @@ def test_an_error_has_copies_with_other_parts():
     assert not copied.but(next_step="").next_step
     assert copied.within("board").within("board").message == "board: It is another."
     assert copied.but("Another.").next_step == "Look."
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("J2 yields by two slopes.", "Robot a: J2 yields by two slopes."),
+        ("UR10e was named.", "Robot a: UR10e was named."),
+        ("The arm drifts.", "Robot a: the arm drifts."),
+        ("A joint slipped.", "Robot a: a joint slipped."),
+    ],
+)
+def test_names_keep_their_capitals_behind_the_name_of_a_robot(words, said):
+    assert Finding("note", words).of("Robot a").words == said
+    assert Finding("note", words).of("").words == words

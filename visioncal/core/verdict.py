@@ -175,7 +175,10 @@ class Finding:
         """The same finding prefixed by the name of its camera or robot, if not empty."""
         if not name:
             return self
-        return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
+        first, rest = self.words[0], self.words[1:]
+        # A word with other capitals or digits is a name, as J2.
+        is_plain = rest.startswith(" ") or rest.partition(" ")[0].islower()
+        return replace(self, words=f"{name}: {first.lower() if is_plain else first}{rest}")
 
     def with_do(self, changed: Callable[[Remedy], Remedy]) -> Self:
         """The same finding with its advice changed, if it has one."""
