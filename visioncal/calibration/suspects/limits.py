@@ -23,6 +23,7 @@ from visioncal.core.verdict import (
     without,
 )
 from visioncal.results import Rms, ViewResult
+from visioncal.vision.boards.imaging import BLURRED
 
 _LIMITS = CalibrationLimits()
 # Views that are named.
@@ -348,7 +349,7 @@ def _lost_views(sensor: Sensor) -> Iterator[Finding]:
         "Correct the first of them and those like it, or repeat what is missing.",
         look_at(others[0].view),
     )
-    if 2 * sum("the image is blurred" in other.reason for other in others) > len(others):
+    if 2 * sum(BLURRED in other.reason for other in others) > len(others):
         words = "Focus, and let the arm stand still before each image; these are read by --dense."
         step = Remedy(words, f"{CALIBRATE} --dense")
     yield Finding(

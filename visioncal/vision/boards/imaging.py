@@ -22,6 +22,7 @@ _STRIP = 256
 _LEAST_CONTRAST = 12
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 _SIGNATURES = (b"\x89PNG", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM", b"RIFF")
+BLURRED = "the image is blurred"  # Begins a reason.
 # Instruction for an image in colour.
 GREY = "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
 
@@ -216,8 +217,8 @@ def poor_image_reason(image: Image, max_blur_px: float) -> str:
     weaker_slopes = np.minimum(by_sector, np.roll(by_sector, 8))
     smear = float(_sigma_of(weaker_slopes.max()))
     for words, wide_px in (
-        ("the image is blurred, its sharpest edges are", blur),
-        ("the image is blurred along one direction, as by motion: edges across it are", smear),
+        (f"{BLURRED}, its sharpest edges are", blur),
+        (f"{BLURRED} along one direction, as by motion: edges across it are", smear),
     ):
         if wide_px > max_blur_px:
             return f"{words} {wide_px:.0f} px wide (limit {max_blur_px:g} px)"
