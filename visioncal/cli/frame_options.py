@@ -16,9 +16,7 @@ from visioncal.cli.options import (
 )
 from visioncal.cli.session_options import RobotPoseOptions
 from visioncal.core.choice import Choice, camera_name, robot_name
-from visioncal.core.choices import (
-    UNITS_M,
-)
+from visioncal.core.choices import UNITS_M
 from visioncal.core.options import argument, flag, numbers_option, option
 from visioncal.core.parsing import FORMS, POSE
 

@@ -23,14 +23,7 @@ from visioncal.cli.options import (
     out_folder,
 )
 from visioncal.core.choice import Choice
-from visioncal.core.choices import (
-    SITE_FILE,
-    WIDEST_RAD,
-    ActKind,
-    Convention,
-    SolverName,
-    Standard,
-)
+from visioncal.core.choices import SITE_FILE, WIDEST_RAD, ActKind, Convention, SolverName, Standard
 from visioncal.core.limits import RecoveryLimits
 from visioncal.core.options import REQUIRED, argument, flag, numbers_option, option
 from visioncal.core.parsing import serial_in, views_in
@@ -251,9 +244,7 @@ class LoadOptions:
         "Its centre in the flange [m].", form="x,y,z", default="0,0,0", needs="targets"
     )
     temperatures: str | None = option(
-        "Temperatures of links [deg C]; of an arm with drift.",
-        metavar="T1,T2,...",
-        needs="targets",
+        "Temperatures of links [deg C]; of an arm with drift.", metavar="T1,T2,...", needs="targets"
     )
 
 

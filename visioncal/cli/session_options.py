@@ -27,9 +27,7 @@ from visioncal.core.choices import (
     Standard,
 )
 from visioncal.core.options import REQUIRED, SIZE, argument, flag, numbers_option, option
-from visioncal.core.parsing import (
-    names_in,
-)
+from visioncal.core.parsing import names_in
 from visioncal.interchange.mends import Mends, mend_option
 from visioncal.live.capture.devices import CAMERAS
 from visioncal.live.capture.options import Stillness

@@ -52,9 +52,7 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
         np.repeat(likelihood.seen, 2),
     )
     sigmas, value = extended.most_likely(
-        start,
-        np.append(seen, True),
-        np.append(np.full(len(start) - 1, LEAST_SIGMA), _NOTHING),
+        start, np.append(seen, True), np.append(np.full(len(start) - 1, LEAST_SIGMA), _NOTHING)
     )
     gain = 2.0 * (likelihood.white[1] - value)
     # Beyond the reach of their linear columns, the gain is that of a matrix without a determinant.

@@ -20,13 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visioncal.core.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.core.linalg import (
-    NULL_SHARE,
-    covariance_from,
-    damped_step,
-    eigenvalue_shares,
-    gram,
-)
+from visioncal.core.linalg import NULL_SHARE, covariance_from, damped_step, eigenvalue_shares, gram
 from visioncal.core.robust import ROUNDS
 from visioncal.core.transforms import apply_each, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows

@@ -12,14 +12,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
 from visioncal.core.robust import REFINED, nearest, trimmed_start, trimmed_sum
-from visioncal.core.transforms import (
-    LEVER_M,
-    adjoint,
-    compose,
-    distances_m,
-    invert,
-    mean_transform,
-)
+from visioncal.core.transforms import LEVER_M, adjoint, compose, distances_m, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 

@@ -12,15 +12,7 @@ import numpy as np
 
 from visioncal.core.errors import ConvergenceError, DegenerateError
 from visioncal.core.transforms import apply, compose, distances_m, invert
-from visioncal.core.types import (
-    Camera,
-    Corners,
-    FloatArray,
-    IntArray,
-    Mask,
-    Target,
-    evenly,
-)
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target, evenly
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.joining import Network, Relation
 from visioncal.fit.weights import first_weighed, on_planes

@@ -35,8 +35,7 @@ class Mends:
     )
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = (
         mend_option(
-            "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.",
-            parse=places_in,
+            "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.", parse=places_in
         )
     )
     without_tool: tuple[tuple[int, ...], tuple[float, ...]] | None = mend_option(

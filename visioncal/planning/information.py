@@ -255,10 +255,7 @@ def stated(cell: PlanCell, *, estimates_lens: bool = False) -> LensBoardParamete
 
 
 def pick_jacobian(
-    cell: PlanCell,
-    q: FloatArray,
-    recorded: RecordedStops | None,
-    size: int,
+    cell: PlanCell, q: FloatArray, recorded: RecordedStops | None, size: int
 ) -> FloatArray:
     """Jacobian (k, 6, p) of things that the camera sees where stops see the board's middle.
 
@@ -395,11 +392,7 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
 
 
 def with_arm_errors(
-    cell: AnyCell,
-    purpose: Purpose,
-    problem: Problem,
-    q: FloatArray,
-    arm: ArmErrors | None = None,
+    cell: AnyCell, purpose: Purpose, problem: Problem, q: FloatArray, arm: ArmErrors | None = None
 ) -> Problem:
     """Adds errors of the arm to a problem: the purpose's, or those that the stops show."""
     if purpose.blocks:

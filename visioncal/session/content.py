@@ -10,12 +10,7 @@ from visioncal.core.documents.tables import TextTable
 from visioncal.core.files import one_line
 from visioncal.core.types import Camera, Corners, Mount, Need, Target
 from visioncal.session import columns as cols
-from visioncal.session.corners import (
-    CornerTable,
-    check_points,
-    corners_by_view,
-    with_corners,
-)
+from visioncal.session.corners import CornerTable, check_points, corners_by_view, with_corners
 from visioncal.session.document import (
     CameraTable,
     Declaration,

@@ -161,8 +161,7 @@ class NeedTable(TableModel):
     deg: Positive | None = None
     corrected: bool = False
     at: Annotated[
-        Any,
-        Check(f'"views" or [x, y, z] in the base, in metres (under {FAR_M:g})', _is_place),
+        Any, Check(f'"views" or [x, y, z] in the base, in metres (under {FAR_M:g})', _is_place)
     ] = "views"
 
     @property

@@ -174,11 +174,7 @@ def chosen_of(
 
 
 def select(
-    session: S,
-    choice: Choice,
-    needs: Collection[Part] = PARTS,
-    *,
-    robot_between: bool = True,
+    session: S, choice: Choice, needs: Collection[Part] = PARTS, *, robot_between: bool = True
 ) -> S:
     """Selects one camera, robot and target from a session; see `Session.of` and `choose`.
 

@@ -16,9 +16,7 @@ from visioncal.core.summaries import html_card, text_card
 from visioncal.core.types import Image, Image16, Target
 from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
 from visioncal.session.content import SessionContent
-from visioncal.session.corners import (
-    read_corners,
-)
+from visioncal.session.corners import read_corners
 from visioncal.session.images import FolderImages, MemoryImages
 from visioncal.session.reading import session_text
 from visioncal.session.saving import digest_of, save_session

@@ -185,10 +185,7 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
     elastic = ElasticResult(
         joints=tuple(
             _springs(
-                arm.joint_names,
-                values,
-                np.sqrt(np.diag(after)),
-                torques + arm.load_torques(seen.q),
+                arm.joint_names, values, np.sqrt(np.diag(after)), torques + arm.load_torques(seen.q)
             )
         ),
         not_determined=(),

@@ -127,10 +127,7 @@ _KINDS = {
             AGAIN,
         ),
     ),
-    PAIRING: (
-        "images are in other rows than their poses: {pairs}",
-        _PAIR_AGAIN,
-    ),
+    PAIRING: ("images are in other rows than their poses: {pairs}", _PAIR_AGAIN),
     VIEW: (
         "{name} alone contradicts the calibration: its board {moved}",
         Remedy(

@@ -6,17 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import (
-    KEPT_SHARE,
-    Fit,
-    robust_fits,
-)
-from visioncal.calibration.guess.readings import (
-    Change,
-    Hypothesis,
-    SideReading,
-    changes,
-)
+from visioncal.calibration.guess.fit import KEPT_SHARE, Fit, robust_fits
+from visioncal.calibration.guess.readings import Change, Hypothesis, SideReading, changes
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.transforms import invert

@@ -122,9 +122,7 @@ def with_lasting_errors(fit: Fit, arms: Mapping[str, RobotArm]) -> Fit:
 
 
 def change_each(
-    arms: Mapping[str, RobotArm],
-    fit: Fit,
-    change: Callable[[RobotArm, Problem, State], RobotArm],
+    arms: Mapping[str, RobotArm], fit: Fit, change: Callable[[RobotArm, Problem, State], RobotArm]
 ) -> dict[str, RobotArm]:
     """Changes one arm after the other, with the errors of the others in the problem.
 

@@ -25,11 +25,7 @@ from visioncal.calibration.stages.likely_steps import steps_of, with_free_sizes
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
 from visioncal.calibration.suspects.moved_views import PoseFault
-from visioncal.calibration.suspects.outliers import (
-    explained_outliers,
-    movements,
-    versions,
-)
+from visioncal.calibration.suspects.outliers import explained_outliers, movements, versions
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter

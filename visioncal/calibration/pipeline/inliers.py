@@ -22,10 +22,7 @@ from visioncal.estimation.outliers import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import (
-    Solution,
-    solve_problem,
-)
+from visioncal.estimation.solve import Solution, solve_problem
 from visioncal.model.effects import FrameCreeps
 from visioncal.vision.pnp import ViewPoses
 

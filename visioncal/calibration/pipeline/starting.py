@@ -155,10 +155,7 @@ def _chosen(
 
 
 def _ambiguous(
-    problem: Problem,
-    candidates: Candidates,
-    distances: FloatArray,
-    edges: Mapping[str, FloatArray],
+    problem: Problem, candidates: Candidates, distances: FloatArray, edges: Mapping[str, FloatArray]
 ) -> Mask:
     """(n,) whether another candidate is as likely as the nearest, by distances (n, k) [m]."""
     ordered, ambiguous = np.sort(distances, axis=1), np.zeros(len(distances), dtype=bool)

@@ -15,12 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares, nnls
 
-from visioncal.calibration.stages.depth_cells import (
-    FEWEST_CELLS,
-    GATE,
-    Cells,
-    Sensor,
-)
+from visioncal.calibration.stages.depth_cells import FEWEST_CELLS, GATE, Cells, Sensor
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import counted, figure, view_words

@@ -30,10 +30,7 @@ from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.boards import NotFound, kind_of
 from visioncal.vision.boards.checkerboard import Checkerboard
-from visioncal.vision.boards.imaging import (
-    decode_image,
-    faint_jpeg,
-)
+from visioncal.vision.boards.imaging import decode_image, faint_jpeg
 from visioncal.vision.detection import ONE_OPENCV_THREAD, find_corners
 from visioncal.vision.targets import corner_positions
 

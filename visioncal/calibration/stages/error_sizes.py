@@ -17,14 +17,7 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
-from visioncal.model.effects import (
-    EFFECTS,
-    Displacement,
-    Effect,
-    LensGrows,
-    LensSteps,
-    Named,
-)
+from visioncal.model.effects import EFFECTS, Displacement, Effect, LensGrows, LensSteps, Named
 from visioncal.model.effects.effect import LensEffect
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics, project, project_with_jacobian

@@ -24,13 +24,7 @@ from visioncal.vision.boards.identify import (
     identify_plain,
     with_article,
 )
-from visioncal.vision.targets import (
-    board_words,
-    corner_positions,
-    extent_m,
-    outline,
-    target_names,
-)
+from visioncal.vision.targets import board_words, corner_positions, extent_m, outline, target_names
 
 # Images that are searched for any board: at first, and where none shows the declared one.
 LOOKED_AT, LOOKED_AT_LAST = 3, 12

@@ -11,11 +11,7 @@ from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
 from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
-from visioncal.estimation.joint import (
-    diverging,
-    fit_jointly,
-    others_of,
-)
+from visioncal.estimation.joint import diverging, fit_jointly, others_of
 from visioncal.vision.corners import CornerStack, floored_sigma_px
 from visioncal.vision.pnp import ViewPoses
 

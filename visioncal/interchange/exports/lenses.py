@@ -7,12 +7,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, known_name, rounded_up
 from visioncal.core.types import Camera, FloatArray
-from visioncal.vision.camera import (
-    intrinsics,
-    normalise,
-    project_with_jacobian,
-    with_intrinsics,
-)
+from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian, with_intrinsics
 
 # Coefficients of OpenCV's k1, k2, p1, p2, k3 that each model has.
 POORER: Mapping[str, int] = {"pinhole": 0, "radtan": 4, "plumb_bob": 5}

@@ -21,12 +21,7 @@ from visioncal.live.capture.journal import picture_name, posed, state_of
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
 from visioncal.live.capture.take import Missed, TakenView, image_motion_px, pictured_views
 from visioncal.live.drivers.manual import ManualArm
-from visioncal.live.drivers.protocols import (
-    ArmState,
-    MovingArm,
-    RequestingArm,
-    StoredPictures,
-)
+from visioncal.live.drivers.protocols import ArmState, MovingArm, RequestingArm, StoredPictures
 from visioncal.live.page.drawing import coverage_svg, live_picture
 from visioncal.live.page.outcome import Outcome, ask_command
 from visioncal.live.page.state import (

@@ -22,13 +22,7 @@ from visioncal.vision.boards.kind import (
     sigma_of,
     size_of,
 )
-from visioncal.vision.boards.layout import (
-    LAYOUT_MARKERS,
-    find_tags,
-    once,
-    read_markers,
-    side_share,
-)
+from visioncal.vision.boards.layout import LAYOUT_MARKERS, find_tags, once, read_markers, side_share
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
 from visioncal.vision.boards.template import SQUARE
 
