@@ -60,7 +60,8 @@ def plan_instrument(options: PlanOptions, source: Source, kept: Kept) -> str:
         start_q=start,
     )
     sentences = plan.sentences(options.seed)
-    stops = _stops(plan, first)
+    pairs = enumerate(zip(plan.q, plan.via, strict=True), first)
+    stops = [Stop(view, q, via, "") for view, (q, via) in pairs]
     document = {
         "schema": 1,
         "visioncal": __version__,
@@ -99,11 +100,6 @@ def plan_instrument(options: PlanOptions, source: Source, kept: Kept) -> str:
         )
     report_written(written, quiet=options.as_json)
     return ""
-
-
-def _stops(plan: InstrumentPlan, first: int) -> list[Stop]:
-    pairs = enumerate(zip(plan.q, plan.via, strict=True), first)
-    return [Stop(view, q, via, "") for view, (q, via) in pairs]
 
 
 def _table(plan: InstrumentPlan, stops: list[Stop]) -> str:

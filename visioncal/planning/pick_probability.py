@@ -107,8 +107,13 @@ class Picking:
         """
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
         shift_m = np.inf if self.need.mm is None else 1e-3 * self.need.mm
-        freedom = self._freedom(rows)
-        # Of all noise, and of the robot's by level.
+        # Degrees of freedom of all noise, and of the robot's levels. A level that the noise of
+        # corners hides is estimated from few: these are twice the square of its relative precision,
+        # by the Fisher information of its square.
+        stops = len(rows) + (0 if self.recorded is None else self.recorded.stops)
+        share = (stops - 2) / max(stops, 1) * (stops / max(len(rows), 1))
+        by_level = share * self._known_levels[rows].sum(axis=0)
+        freedom = np.maximum([6 * stops - 12, *by_level], 1.0)
         growth, *levels = chi2_limit(_LARGER_NOISE, freedom) / freedom
         chances = []
         for (jacobian, noise), world in zip(self._sights, self.worlds, strict=True):
@@ -130,17 +135,6 @@ class Picking:
                 covariances += np.einsum("l,lmij->mij", levels, noise)
             chances.append(chance_within(covariances, turn_rad, shift_m, float(freedom[-1])))
         return float(np.mean(chances))
-
-    def _freedom(self, rows: IntArray) -> FloatArray:
-        """(3,) degrees of freedom of all noise, and of the robot's levels of rotation and position.
-
-        A level that the corners' noise hides is estimated from few: these are twice the square of
-        its relative precision, by the Fisher information of its square.
-        """
-        so_far = 0 if self.recorded is None else self.recorded.stops
-        stops, share = len(rows) + so_far, (len(rows) + so_far) / max(len(rows), 1)
-        by_level = (stops - 2) / max(stops, 1) * share * self._known_levels[rows].sum(axis=0)
-        return np.maximum([6 * stops - 12, *by_level], 1.0)
 
     @cached_property
     def _known_levels(self) -> FloatArray:
