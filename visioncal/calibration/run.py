@@ -40,8 +40,6 @@ class Run:
 
     calibration: Calibration  # The result.
     evidence: tuple[ViewEvidence, ...]  # One entry for each view of the session.
-    # Residual of each view, by a fit without its stop [m], [px].
-    left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     # Corners found in each image, by view, from which alone the run can be repeated; empty where
     # more of the images was used.
     searches: Mapping[int, Searched] = field(default_factory=dict)
@@ -122,12 +120,9 @@ def run(session: Session | Path | str, **options: Unpack[CalibrationOptions]) ->
     if _sees_points(state):
         return _points_run(state)
     state = run_stages(state)
-    held_out = state.assessment.held_out
-    residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
-    left_out = dict(zip(state.used, residuals, strict=True))
     searches = {} if state.dense else state.searches
     result = _with_depth(state) if _has_depth(state) else (result_of(state), view_evidence(state))
-    return Run(*result, left_out, searches)
+    return Run(*result, searches)
 
 
 def _sees_points(state: RunState) -> bool:

@@ -217,8 +217,7 @@ class Prediction:
     # (k, n) by the consistent standard parameters [N m]; None without these.
     consistent_nm: FloatArray | None
     used: Mask  # (k, n) mask of valid torques.
-    q: FloatArray  # (k, n) joint angles, filtered likewise [rad].
-    dq: FloatArray  # (k, n) their speeds [rad/s].
+    dq: FloatArray  # (k, n) speeds of the joints, filtered likewise [rad/s].
     notes: tuple[str, ...] = ()  # Messages on faults of the samples.
 
     def rms_nm(self, predicted_nm: FloatArray) -> FloatArray:
@@ -241,7 +240,6 @@ def predict(identified: Identified, stream: Conditioned) -> Prediction:
         stream.filtered(identified.torques),
         stream.filtered(identified.consistent_torques) if with_bodies else None,
         stream.used,
-        stream.filtered(lambda motion: motion.q),
         stream.filtered(lambda motion: motion.dq),
         stream.notes,
     )

@@ -90,8 +90,6 @@ class Effect:
     flange_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
     # (n,) the observations to which `flange_jacobian` applies; None for all.
     rows_concerned: Mask | None = None
-    # Number of the last values that are random coefficients, which no stop determines.
-    random: int = 0
     # Indices of the values that are relative sizes of targets, with slopes at the measured poses.
     sizes: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 

@@ -35,7 +35,6 @@ class RobotLikelihood:
     # Their likelihood by the free unknowns. The first sizes are the robots' levels of rotation and
     # translation, robot by robot.
     model: MixedModel
-    moving: Mask  # (p,) mask of the free unknowns.
     members: IntArray  # (u, w) the robots of each unit; see `Problem.units`.
     stops: IntArray  # (u,) the stop of each unit that has observations.
     before: FloatArray  # (r, 2) the robots' previous levels.
@@ -198,6 +197,4 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
         np.zeros((jacobian.shape[2], len(levels))),
         SizePrior.of_ratios([(2 * robot, 2 * robot + 1) for robot in seen], len(levels)),
     )
-    return RobotLikelihood(
-        reduced.by_flanges, reduced.cost, model, moving, members, stops, noise.robots
-    )
+    return RobotLikelihood(reduced.by_flanges, reduced.cost, model, members, stops, noise.robots)

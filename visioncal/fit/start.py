@@ -48,7 +48,6 @@ class Start:
     lenses: Mapping[str, Camera]
     edges: Mapping[str, FloatArray]  # (4, 4) `parent_from_frame` of the unknown edges.
     distances: FloatArray  # (n,) of the sightings from what the edges predict [m].
-    rivals: tuple[FloatArray, ...]  # Other poses (j, 4, 4) that each sighting may have.
     # (n,) sightings that may agree: most of their own corners do, and they are not those of a row
     # nearby.
     sound: Mask
@@ -111,7 +110,6 @@ def start_of(cell: Cell, lenses: Mapping[str, Camera] | None = None, early: floa
     seers = {sighting.seer for sighting in cell.sightings}
     lenses = {name: lens for name, lens in lenses.items() if name in seers}
     sightings, distances = list(cell.sightings), np.zeros(len(known))
-    rivals = [option.poses for option in known]
     # By which symmetry the first view of each board is turned: that one, if a fit uses it, keeps
     # its numbers.
     firsts, stated = dict[str, int](), {name for s in sightings if s.is_stated for name in s.pair}
@@ -129,23 +127,18 @@ def start_of(cell: Cell, lenses: Mapping[str, Camera] | None = None, early: floa
         off = off * (not sighting.is_stated)
         best = int(off.argmin())
         distances[at] = off[best]
-        turn = int(option.turns[best])
         if isinstance(sighting.evidence, Corners):
-            orders = numbers[sighting.seen]
+            orders, turn = numbers[sighting.seen], int(option.turns[best])
             first = firsts.setdefault(sighting.seen, turn if sighting.seen in turnable else 0)
-            # Turns are powers of one, and candidates come in blocks of all of them.
-            turn, was = (turn - first) % len(orders), turn
-            best += turn - was
-            if turn:
+            # Turns are powers of one.
+            if turn := (turn - first) % len(orders):
                 ids = np.argsort(orders[turn])[sighting.evidence.ids]
                 sightings[at] = replace(sighting, evidence=replace(sighting.evidence, ids=ids))
-        others = np.flatnonzero((option.turns == turn) & (np.arange(len(off)) != best))
-        rivals[at] = option.poses[[best, *others]]
     for name, first in firsts.items():
         if first:
             edges[name] = edges[name] @ invert(rotation_transforms(cell.boards[name])[first])
     cell = cell.with_sightings(sightings)
-    return Start(read, cell, lenses, edges, distances, tuple(rivals), sound, tied.ambiguous)
+    return Start(read, cell, lenses, edges, distances, sound, tied.ambiguous)
 
 
 def start_lenses(cell: Cell, known: Mapping[str, Camera]) -> dict[str, Camera]:

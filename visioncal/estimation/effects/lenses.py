@@ -252,7 +252,7 @@ class LinearisedCorners:
         values = np.append(self.camera_parameters.values[self.free], np.zeros(fields))
         held = np.append(self.held, np.zeros(fields, dtype=bool))
         scales = np.flatnonzero(np.isin(self.free, self.camera_parameters.scales))
-        return Effect(LENSES, values, prior, held, by_sensor, random=fields, sizes=scales)
+        return Effect(LENSES, values, prior, held, by_sensor, sizes=scales)
 
     @property
     def views(self) -> tuple[int, ...]:
