@@ -117,7 +117,7 @@ class Identified:
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
 
 
-def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
+def _check(kind: str, words: str, do: Remedy) -> _Judged:
     return "check", Finding(kind, words, do)
 
 

@@ -40,9 +40,7 @@ class SessionStart:
     views: tuple[int, ...]  # Number of the first view of each stop.
 
 
-def calibrate_partially(
-    session: Session, *, progress: Progress | None = None
-) -> tuple[RunState, str]:
+def calibrate_partially(session: Session, *, progress: Progress) -> tuple[RunState, str]:
     """Calibrates the hand-eye level of a session as far as it goes; raises DataError.
 
     Returns:
@@ -52,8 +50,7 @@ def calibrate_partially(
         raise _missing_model_error(session)
     run = RunState(session, progress, level="hand-eye")
     for index, stage in enumerate(STAGES):
-        if progress is not None:
-            progress(stage.name, index, len(STAGES))
+        progress(stage.name, index, len(STAGES))
         try:
             run = stage.run(run)
         except DegenerateError as error:

@@ -165,7 +165,7 @@ def ur_kinematics_yaml(
     return "\n".join([*lines, f"  hash: {calibration_hash}", ""])
 
 
-def ur_flange(robot: Robot, like: DHTable | None = None) -> FloatArray:
+def ur_flange(robot: Robot, like: DHTable) -> FloatArray:
     """Flange pose (4, 4) in the last link of `ur_kinematics_yaml`, which ROS takes for the flange.
 
     Raises:

@@ -232,7 +232,7 @@ def _remedy(
     )
 
 
-def board_correction(session: Session | None, board: str, figures: str) -> tuple[str, str]:
+def board_correction(session: Session, board: str, figures: str) -> tuple[str, str]:
     """How figures such as `square_m = 0.03` are written into the description of a board.
 
     Returns:
@@ -240,7 +240,7 @@ def board_correction(session: Session | None, board: str, figures: str) -> tuple
         visioncal, of which a session's folder has no file.
     """
     named = ""
-    if session is not None and isinstance(session.images, FolderImages):
+    if isinstance(session.images, FolderImages):
         named = declared_targets(session.declaration).get(board, "")
     if named not in target_names():
         return f"write {figures} in the board's .toml", ""

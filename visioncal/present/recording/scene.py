@@ -48,7 +48,7 @@ class Scene(CellPoses):
     @classmethod
     def planned(
         cls,
-        robot: Robot | None,
+        robot: Robot,
         states: Mapping[int, RobotState],
         size_m: float,
         seen: "Seen | None" = None,
@@ -68,7 +68,7 @@ class Scene(CellPoses):
         return cls(
             frames,
             {"flange": states},
-            {} if robot is None else {"": robot},
+            {"": robot},
             {} if seen is None else {paths.CAM_FRAME: seen.camera},
             {} if seen is None else {paths.TARGET_FRAME: seen.target},
             size_m,

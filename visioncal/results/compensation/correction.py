@@ -141,17 +141,14 @@ def predicted_sigma_mm(
 
 
 def unseen(
-    calibration: Calibration,
-    q: FloatArray,
-    loads: Loads | None = None,
-    links_c: FloatArray | None = None,
+    calibration: Calibration, q: FloatArray, loads: Loads, links_c: FloatArray | None
 ) -> Iterator[str]:
     """Loads and temperatures at (m, n) joints that are far from all of the calibration, in words.
 
     See `predicted_sigma_mm`.
     """
     elastic, real = calibration.elastic, calibration.calibrated_robot
-    if elastic is not None and real is not None and loads is not None and loads.any:
+    if elastic is not None and real is not None and loads.any:
         borne = np.abs(real.load_torques(q, loads)).max(axis=0)
         seen = np.array([max(map(abs, joint.torque_nm)) for joint in elastic.joints])
         over = (borne - _BEYOND * seen) * (elastic.compliance + elastic.sigmas)
