@@ -19,9 +19,9 @@ from visioncal.interchange.formats import (
 )
 from visioncal.results import Calibration
 
-# Options that are named as the import's.
 # Readings that a table shows, at most.
 _SHOWN = 12
+# Options that are named as the import's.
 _AS_TYPED = (
     *("camera_file", "mount", "target", "intrinsics"),
     *("images", "resolution", "tip", "instrument"),

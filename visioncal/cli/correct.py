@@ -39,7 +39,7 @@ from visioncal.robot import Loads
 from visioncal.session.columns import column_of
 from visioncal.session.selecting import ARM, EYE
 
-_MOST_SHOWN = 10
+_MOST_SHOWN = 10  # Targets that are named.
 _TOOLS = "flange_from_"
 
 

@@ -47,7 +47,7 @@ from visioncal.session import Session
 from visioncal.session.selecting import ANY, LENS
 from visioncal.vision.targets import stored_target, target_from_document
 
-_SHOWN = 12
+_SHOWN = 12  # Stops that are named.
 _USUAL = "hand-eye"  # Purpose of a camera's stops.
 # Options without which a cell is not known.
 _NEEDED = ("target", "camera", "cam", "board")

@@ -12,7 +12,7 @@ State = TypeVar("State")
 ITERATIONS = 400
 # Decrease of the cost, relative to the cost plus one, below which it has converged.
 SETTLED = 1e-10
-START_DAMPING = 1e-4
+START_DAMPING = 1e-4  # Share of the diagonal.
 # Least damping, and that near the solution, where poorly determined directions would need many
 # damped steps; its inverse leaves no step.
 NEAR_DAMPING = 1e-9

@@ -19,7 +19,7 @@ from scipy.special import fdtr, ndtri
 from visioncal.core.quantiles import root_of
 from visioncal.core.types import FloatArray
 
-_POINTS, _SIZE = 4096, 6
+_POINTS, _SIZE = 4096, 6  # Even directions, and components of an error.
 # In place of infinity: degrees of freedom, radii, and the ratio of a radius to a first guess.
 _INFINITE = 1e6
 # Relative tolerance of a radius.

@@ -33,7 +33,7 @@ UNKNOWN = "not at all"
 _LIMITS = DynamicsLimits()
 _Judged: TypeAlias = tuple[VerdictStatus, Finding]
 _MOTION = "Record, and fit with this one, a motion"
-SCHEMA = 1
+SCHEMA = 1  # Version of the file's form.
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from visioncal.robot.collision import Body, Collisions, arm_bodies
 from visioncal.robot.inertia import Inertias, parameter_transform
 from visioncal.robot.torques import joint_torques
 
-CHECK_HZ = 1000.0
+CHECK_HZ = 1000.0  # Samples a second at which motions are checked against limits.
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation, quaternions, skew
 from visioncal.core.types import FloatArray, IntArray
 
-_GROUP = 100
+_GROUP = 100  # Views whose pairs are all taken, as their number grows by the square.
 # Scalar products of the quaternions from which pairs count in full: up to 165 degrees.
 _FULL_WEIGHT = float(np.cos(np.radians(82.5)) ** 2)
 # The identity and the half turns about x, y, z.

@@ -35,7 +35,7 @@ from visioncal.vision.targets import load_target
 Parent: TypeAlias = Literal["base", "flange"]
 # Squared distance beyond which two poses differ significantly.
 _DIFFERENT = float(chi2_limit(0.05, 6))
-_FEWEST_FOR_SIZE = 3
+_FEWEST_FOR_SIZE = 3  # Images that agree on a board's size.
 
 
 @dataclass(frozen=True, eq=False)

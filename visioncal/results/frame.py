@@ -12,7 +12,7 @@ from visioncal.core.version import __version__
 from visioncal.results.edge import StoredEdge
 from visioncal.results.parts import StoredVerdict
 
-_SCHEMA = 1
+_SCHEMA = 1  # Version of the file's form.
 
 
 @dataclass(frozen=True)

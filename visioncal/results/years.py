@@ -25,7 +25,7 @@ _SIZES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
 # Units of values: rad and m of a transform.
 _UNITS = np.array([2e-3] * 3 + [1e-3] * 3)
 YEAR_DAYS = 365.25
-_STEPS_A_YEAR, _DRIFTS = 0.5, 0.2
+_STEPS_A_YEAR, _DRIFTS = 0.5, 0.2  # Prior rate of steps, and chance of a drift.
 # Changes are looked for as long as they are more probable than not.
 _LIKELY = 0.5
 

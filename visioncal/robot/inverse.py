@@ -31,7 +31,7 @@ _ROTATION_WEIGHT = 1e-4
 # Relative gain in the sum of squares at which a search ends, and the final search from the nearest
 # posture.
 _SEARCH, _POLISH = 1e-3, 1e-9
-_LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
+_LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e8  # Shares of the diagonal.
 # Half range of random starts for joints without limits [rad or m].
 _SPREAD = float(np.pi)
 _TURN = 2 * np.pi

@@ -16,7 +16,7 @@ from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
-STANDARD_GRAVITY_M_S2 = 9.80665
+STANDARD_GRAVITY_M_S2 = 9.80665  # By definition (CGPM 1901).
 # Most that any arm carries [kg], and how far from its flange at most the centre of that is [m].
 MOST_KG, MOST_CENTRE_M = 2500.0, 3.0
 # Keys of a link's mass in a joint's table.

@@ -34,10 +34,10 @@ from visioncal.simulation.touching import Touching, write_touches
 Seen: TypeAlias = Literal["images", "names", "corners", "poses"]
 Progress: TypeAlias = Callable[[float], None]
 
-# Step of finite differences, and perturbations forwards and backwards along each axis: (2, 6, 4,
-# 4).
 # Sigma of a height that is measured by hand, on arms that leave it open [m].
 CALIPER_M = 5e-4
+# Step of finite differences, and perturbations forwards and backwards along each axis: (2, 6, 4,
+# 4).
 _STEP = 1e-6
 _STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
 # Arrays of an arm, of any shape.

@@ -14,7 +14,7 @@ from visioncal.vision.targets import extent_m
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
-_INK, _PAPER, _PLATE = 30, 222, 152
+_INK, _PAPER, _PLATE = 30, 222, 152  # Grey levels.
 # Margin around the print with its shadow, in sides of a square.
 _SHADOW_MARGIN = 1.35
 

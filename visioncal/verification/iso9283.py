@@ -28,6 +28,7 @@ POSES, CYCLES = 5, 30  # By the standard.
 # Estimate, and the ends of its interval of 95 % [mm] or [deg].
 Interval: TypeAlias = tuple[float, float, float]
 _ENDS = np.array([0.025, 0.975])
+# Draws of errors, fewest rows of a pose, and largest difference of one pose [m, rad].
 _DRAWS, _LEAST, _SAME = 20_000, 5, 1e-3
 
 

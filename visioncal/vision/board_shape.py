@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from visioncal.core.types import FloatArray, Target
 from visioncal.vision.targets import corner_positions
 
-SCALE, ASPECT, SHEAR = 0, 1, 9
+SCALE, ASPECT, SHEAR = 0, 1, 9  # Places among a shape's values.
 _BENDS = slice(2, 9)
 # Files use the same order; shear was added last.
 BOARD_NAMES = (

@@ -36,7 +36,7 @@ STARTS = 12
 # Shares of the views that are fitted: two rows exchanged among eight are a quarter, and half are
 # rows apart beside another mistake, which the second is for; fewer would agree with any reading.
 KEPT_SHARE, HALF_SHARE = 0.7, 0.45
-_SUBSET = 4
+_SUBSET = 4  # Views of a start.
 # Standard deviation by axis [rad, or share of the distance], at least and at most: readings are not
 # distinguished by less than the first.
 _LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0

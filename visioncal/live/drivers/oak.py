@@ -22,7 +22,7 @@ from visioncal.vision.camera import matrix_3x3
 # The camera that every OAK has: the colour camera, or the only one.
 _SOCKET = "CAM_A"
 
-_RATE_HZ = 10.0
+_RATE_HZ = 10.0  # Pictures a second.
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
 
 

@@ -30,7 +30,7 @@ PATIENCE_S = 900.0
 _DEAD_S = 4
 # Clients that may wait before one of them says where it stands.
 _MOST_WAITING = 8
-_SLICE_S = 0.05
+_SLICE_S = 0.05  # Longest wait for a line, so that a stop is noticed [s].
 # Longest line in [bytes].
 _MAX_LINE = 500
 _ENDS = re.compile(rb"[\r\n]")

@@ -20,7 +20,7 @@ from visioncal.live.drivers.protocols import Safety
 DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
 # A controller in the same network answers within milliseconds.
 _CONNECT_S = 0.8
-_ANSWER_S = 1.0
+_ANSWER_S = 1.0  # Longest wait for an answer [s].
 _BANNER = "Universal Robots Dashboard Server"
 HEADER = struct.Struct(">HB")
 # Types of RTDE's frames: request of its version, of the controller's, recipes of outputs and of
@@ -31,7 +31,7 @@ _POLYSCOPE_X = 10
 # Primary interface: the read-only port is open where the other may not be.
 PRIMARY_PORTS = (30011, 30001)
 _PRIMARY_HEADER = struct.Struct(">IB")
-_ROBOT_STATE, _CARTESIAN = 16, 4
+_ROBOT_STATE, _CARTESIAN = 16, 4  # Kinds of a message and of its part.
 _TOOL = struct.Struct(">6d6d")
 # Upper bound of a message's size.
 _MAX_BYTES = 1 << 20

@@ -25,7 +25,7 @@ from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
 
 _COLUMNS = 3
-_CURVE_POINTS = 401
+_CURVE_POINTS = 401  # Speeds of a curve of friction.
 
 
 def render_dynamics(run: Run) -> str:

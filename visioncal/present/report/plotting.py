@@ -29,7 +29,7 @@ _VARIABLES = {
     INK: "ink", MUTED: "muted", LINE: "line", ACCENT: "accent", GOOD: "good", BAD: "bad",
     CHECK: "check", CARD: "card",
 }  # fmt: skip
-SMALL = 8.0
+SMALL = 8.0  # Size of small text [pt].
 # Widths at which the text of a figure matches the page's [inches].
 WIDE_IN, MIDDLE_IN = 9.2, 5.0
 _STYLE: Any = {

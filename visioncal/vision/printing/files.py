@@ -12,7 +12,7 @@ from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import Sheet
 from visioncal.vision.targets import read_target, stored_target, target_document
 
-_LEAST_DPI = 50.0
+_LEAST_DPI = 50.0  # Half a millimetre a pixel.
 # Names of this length stay below the 255 bytes of file systems in any script.
 _LONGEST_NAME = 60
 

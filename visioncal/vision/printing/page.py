@@ -25,7 +25,7 @@ _PAGES_MM = {
     "tabloid": (279.4, 431.8),
 }
 _OWN_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)(?:\s*mm)?", re.IGNORECASE)
-_LEAST_MM, _MOST_MM = 20.0, 3000.0
+_LEAST_MM, _MOST_MM = 20.0, 3000.0  # Sides of a page.
 # Smaller squares are limited by the printer's resolution [mm].
 _SMALLEST_MM = 5
 
@@ -34,8 +34,8 @@ EDGE_MM = 5.0
 # Length of a ruler beyond its last tick, for the arrow and its letter.
 ARROW_MM = 8.0
 
-FONT_PT = 7.0
-LINE_MM = 3.1
+FONT_PT = 7.0  # Size of the text.
+LINE_MM = 3.1  # Distance of its lines.
 # Gap of the text to the quiet zone.
 _GAP_MM = 0.5
 
