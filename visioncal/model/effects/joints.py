@@ -19,6 +19,11 @@ class JointEffect(Effect):
     curvature = 1.0
     robot: Robot
 
+    @property
+    def count(self) -> int:
+        """See `Effect`: one value a joint, if a kind has no other."""
+        return self.robot.joint_count
+
     @abstractmethod
     def turns(self, q: FloatArray, moments: Moments) -> FloatArray:
         """Turns (k, n, c) of the joints by each value [rad], where they stand at (k, n) `q`."""

@@ -24,11 +24,6 @@ class _ZerosMove(JointEffect):
 
     bounds = 1e-2, 1e-7, 0.1
 
-    @property
-    def count(self) -> int:
-        """See `Effect`."""
-        return self.robot.joint_count
-
     @abstractmethod
     def left(self, moments: Moments) -> FloatArray:
         """(k,) share of the motion that is still to come."""

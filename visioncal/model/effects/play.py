@@ -19,11 +19,6 @@ class Play(JointEffect):
     kind, bounds = "play", (1e-2, 1e-7, 0.1)
     clause = "the arm's joints have play"
 
-    @property
-    def count(self) -> int:
-        """See `Effect`."""
-        return self.robot.joint_count
-
     def turns(self, q: FloatArray, moments: Moments) -> FloatArray:
         """See `JointEffect`."""
         sides = moments.sides.get(self.frame, np.zeros_like(q))

@@ -19,11 +19,6 @@ class Springs(JointEffect):
     clause = "the arm's joints give way under loads"
     curvature = 200.0  # Under so many newton metres.
 
-    @property
-    def count(self) -> int:
-        """See `Effect`."""
-        return self.robot.joint_count
-
     def turns(self, q: FloatArray, moments: Moments) -> FloatArray:
         """See `JointEffect`."""
         torques = self.robot.load_torques(q, moments.loads.get(self.frame))

@@ -16,11 +16,6 @@ class Zeros(JointEffect):
     kind, bounds = "zeros", (1e-2, 1e-7, 0.1)
     clause = "the arm's joints have other zeros"
 
-    @property
-    def count(self) -> int:
-        """See `Effect`."""
-        return self.robot.joint_count
-
     def turns(self, q: FloatArray, moments: Moments) -> FloatArray:
         """See `JointEffect`."""
         del moments
