@@ -186,6 +186,18 @@ def test_a_model_that_cannot_be_read_is_known_by_its_place_in_the_session():
     assert found[unread] == "misread_joints"
 
 
+def test_a_note_of_a_conversion_is_in_no_file_and_no_doubt():
+    session = pairs_session(MOUNTS[0], *poses_of(MOUNTS[0]))
+    session = session.with_content(document={**session.document, "nmae": "cell"})
+    note = "Found by the poses: they fit as first read."
+    noted = replace(session, warnings=(note, *session.warnings))
+    found = {at.words: at for at in run_stages(RunState(noted), STAGES[:1]).warnings}
+    assert found[note] == Finding("note", note)
+    (misspelt,) = session.warnings
+    assert found[misspelt].kind == "remark"
+    assert found[misspelt].do.words == "In session.toml, correct or delete what this names."
+
+
 def test_an_error_has_copies_with_other_parts():
     error = OtherBoardError.of(Finding("other_board", "It is another.", Remedy("Look.")))
     copied = error.but(culprits=["view 3"])

@@ -64,6 +64,8 @@ class SessionContent:
     corner_table: CornerTable | None = None
     notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
     unread_models: tuple[str, ...] = ()  # The warnings that are of robots' models.
+    # The files of other warnings, but those of what the session was converted from.
+    warned_files: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def assemble(
@@ -123,17 +125,16 @@ class SessionContent:
         if corners is not None:
             columns, views, corners = with_corners(columns, views, corners, tuple(several))
         check_images_can_be_used(declaration, views)
-        warnings = [
-            *declaration_warnings(declaration),
-            *cols.column_warnings(columns),
-            *target_warnings(declaration, target_document),
-        ]
+        warned = {
+            **dict.fromkeys(declaration_warnings(declaration), "session.toml"),
+            **dict.fromkeys(cols.column_warnings(columns), "views.csv"),
+            **dict(target_warnings(declaration, target_document)),
+        }
         check_kinds_named(declaration, views)
         check_frames(declaration, views)
         if declaration.is_network:
-            warnings += stop_warnings(declaration, views)
+            warned |= dict.fromkeys(stop_warnings(declaration, views), "views.csv")
         robot_document, problems = read_robots(declaration, folder, robot_document)
-        warnings += problems
         session = cls(
             document,
             columns,
@@ -141,12 +142,13 @@ class SessionContent:
             next(iter(targets.values()), None),
             target_document,
             images,
-            tuple(warnings),
+            (*warned, *problems),
             robot_document,
             several,
             corner_table=corners,
             notes=tuple(outside_notes(declaration, folder)),
             unread_models=tuple(problems),
+            warned_files=warned,
         )
         if corners is not None:
             seen = (view for view in views if view.has_corners)
@@ -179,7 +181,9 @@ class SessionContent:
         for name, stream in streams.items():
             check_stream(name, stream)
         ordered = dict(sorted(streams.items()))
-        return replace(self, streams=ordered, warnings=(*self.warnings, *gap_warnings(ordered)))
+        gaps = dict(gap_warnings(ordered))
+        warned, warnings = {**self.warned_files, **gaps}, (*self.warnings, *gaps)
+        return replace(self, streams=ordered, warnings=warnings, warned_files=warned)
 
     @property
     def need(self) -> Need | None:

@@ -149,12 +149,14 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
             )
 
 
-def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
-    """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
+def target_warnings(
+    declaration: Declaration, document: Mapping[str, Any] | None
+) -> Iterator[tuple[str, str]]:
+    """Warnings of misspelt keys in the targets' descriptions, see `read_targets`; and files."""
     for name, path in (paths := declared_targets(declaration)).items():
         described = document if len(paths) == 1 else (document or {}).get(name)
         for words in misspelt_keys(described or {}):
-            yield f"{path}: {words}"
+            yield f"{path}: {words}", path
 
 
 def is_file(name: object) -> bool:

@@ -189,16 +189,18 @@ def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
     )
 
 
-def gap_warnings(streams: Mapping[str, Stream]) -> Iterator[str]:
-    """Warnings of gaps in streams."""
+def gap_warnings(streams: Mapping[str, Stream]) -> Iterator[tuple[str, str]]:
+    """Warnings of gaps in streams, and their files."""
     for name, stream in streams.items():
         behind, stamps_s = stream.gaps(), stream.stamps_s
         if len(behind):
             steps = np.diff(stamps_s)
             worst = int(behind[np.argmax(steps[behind])])
-            yield (
-                f"{FOLDER}/{name}.csv: samples are missing in {counted(len(behind), 'place')}; the "
+            file = f"{FOLDER}/{name}.csv"
+            words = (
+                f"{file}: samples are missing in {counted(len(behind), 'place')}; the "
                 f"widest gap is {steps[worst]:.3g} s, {stamps_s[worst] - stamps_s[0]:.6g} s from "
                 f"the start, where samples are usually {np.median(steps):.3g} s apart. Nothing is "
                 "interpolated across them."
             )
+            yield words, file

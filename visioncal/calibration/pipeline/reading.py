@@ -93,12 +93,12 @@ def _suspicious(session: Session) -> Iterator[Finding]:
     # A column that may be misspelt, or the user's own.
     of_columns = [*column_warnings(session.columns)]
     for warning in session.warnings:
+        file = session.warned_files.get(warning)
         if warning in session.unread_models:
             yield Finding("misread_joints", warning, Remedy(_MODEL_STEP))
-        elif warning in of_columns:
+        elif file is None or warning in of_columns:
             yield Finding(NOTE, warning)
         else:
-            file = warning.partition(": ")[0]
             step = Remedy(f"In {file}, correct or delete what this names.")
             yield Finding("remark", warning, step)
 
