@@ -109,8 +109,8 @@ def evidence_of(
     cause = cause or ChangeHypothesis("nothing", np.zeros(0))
     shares = (1.0,) if belief.repeated is None else _NEW_SHARES
     new_m = max(belief.noise.robots[0, 1], LEAST_SIGMA) * np.sqrt(shares)
-    # Repeatability of well-kept arms [m], and the factor by which others differ from it: the log-
-    # normal prior of what is new.
+    # Repeatability of well-kept arms [m], and the factor by which others differ from it: the
+    # log-normal prior of what is new.
     log_priors = -0.5 * (np.log(new_m / 3e-5) / np.log(2.0)) ** 2
     log_priors -= np.logaddexp.reduce(log_priors) + np.log(len(cause.noise_factors))
     prior_of = dict(zip(shares, log_priors.tolist(), strict=True))

@@ -200,8 +200,7 @@ class GridBoard(BoardKind):
         seen = [self.whole(target, *view) for view in zip(ids, px, strict=True)]
         share, scatter = side_share(*zip(*seen, strict=True))
         spacing = 1.0 / share - 1.0
-        # A print's gaps are true to a hundredth of a side, unless corners scatter by more. Error of
-        # a print's gaps, as a share of a side.
+        # A print's gaps are true to a hundredth of a side, unless corners scatter by more.
         is_other = abs(spacing - target.spacing) > max(0.01, scatter)
         return {"spacing": round(spacing, 2)} if is_other else {}
 
