@@ -43,7 +43,6 @@ CAMERA = replace(
 )
 # What a calibration of few views leaves: of the focal length, the centre [px] and k1.
 LENS_SIGMA = np.array([0.4, 0.5, 0.5, 0.002])
-MOTION = (1.0, 0.4, 0.1, 0.06, 0.05, 0.5)
 
 
 @dataclass(frozen=True)

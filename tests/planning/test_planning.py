@@ -63,7 +63,7 @@ def so_far_of(cell: SimulatedCell, **changes) -> tuple[RunState, str]:
 
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-HAND_EYE, OFFSETS, KINEMATICS = (PURPOSES[name] for name in ("hand-eye", "offsets", "kinematics"))
+HAND_EYE, KINEMATICS = (PURPOSES[name] for name in ("hand-eye", "kinematics"))
 CELL = CellOptions(robot="ur5e")
 
 
