@@ -16,7 +16,7 @@ from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpr
 from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.robot.elasticity import BY_CONTROLLER, OF_MASSES, SOFT, weight_words
 from visioncal.robot.errors import ArmErrors
-from visioncal.robot.loads import load_ranges
+from visioncal.robot.loads import STANDARD_GRAVITY_M_S2, load_ranges
 
 
 def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult | None:
@@ -128,7 +128,7 @@ class _Slopes:
 def slopes_of(arm: ArmData) -> dict[int, TwoSlopes]:
     """Joints that yield by another slope beyond a torque, by number; only heavy loads show it."""
     model, loads = arm.model, arm.loads
-    pull = loads.payload_kg * 9.81 + np.linalg.norm(loads.force_n, axis=1)
+    pull = loads.payload_kg * STANDARD_GRAVITY_M_S2 + np.linalg.norm(loads.force_n, axis=1)
     if COMPLIANCE not in model.weights or pull.max(initial=0.0) < _HEAVY_N or len({*pull}) < 2:
         return {}
     tested, knees = _Slopes.of(arm), dict[int, float]()
