@@ -64,8 +64,10 @@ def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
     return {**robots(calibration), **calibrated}
 
 
-def stated_boards(session: Session) -> dict[str, Target]:
+def stated_boards(session: Session | None) -> dict[str, Target]:
     """Boards as the session states them, by their names in results."""
+    if session is None:
+        return {}
     boards = {**session.plates, **session.boards}
     return {"target": boards[""], **boards} if "" in boards else boards
 
