@@ -121,6 +121,13 @@ class Fit:
         added = 0.0 if self.considered is None else self.considered
         return np.asarray(self.estimate.covariance + added)
 
+    @cached_property
+    def used_heads(self) -> tuple[tuple[Gram, FloatArray], ...]:
+        """The sightings in use, with their `Gram.heads` at the estimate."""
+        kept = [(gram, self.used[gram.rows]) for gram in self.grams]
+        used = (gram if mask.all() else gram.take(mask) for gram, mask in kept if mask.any())
+        return tuple((gram, gram.heads(self.estimate.logs)) for gram in used)
+
     def edge(self, name: str) -> FloatArray:
         """(4, 4) `parent_from_frame`."""
         return self.state.values["edge", name]

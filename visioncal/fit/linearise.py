@@ -112,6 +112,12 @@ class Gram:
         moved = local[:, :, : self.moves.shape[1]] @ self.moves
         return np.concatenate([moved, local @ self.fixed], axis=2)
 
+    def by_errors_and_sum(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(k, a, f) by errors, of (k, a, d) by local columns; (a, c + n) by unknowns, summed."""
+        moved, f = local[:, :, : self.moves.shape[1]] @ self.moves, 6 * len(self.flanges)
+        summed = moved[:, :, f:].sum(axis=0), local.sum(axis=0) @ self.fixed
+        return moved[:, :, :f], np.concatenate(summed, axis=1)
+
     def in_common(self, part: Products) -> tuple[FloatArray, FloatArray]:
         """Gram matrices by errors, unknowns and residual.
 
@@ -121,16 +127,18 @@ class Gram:
         """
         f, moves = 6 * len(self.flanges), self.moves
         by_local = np.swapaxes(moves, 1, 2) @ part.heads[:, : moves.shape[1]]
+        of_errors, rest = by_local[:, :f], by_local[:, f:]
         by_all = np.concatenate(
-            [self.by_unknowns(by_local[:, :, :-1]), by_local[:, :, -1:]], axis=2
+            [self.by_unknowns(of_errors[:, :, :-1]), of_errors[:, :, -1:]], axis=2
         )
         c, fixed = moves.shape[2] - f, np.pad(self.fixed, (0, 1))
         fixed[-1, -1] = 1.0
         common = np.zeros((len(self.columns) + 1, len(self.columns) + 1))
-        common[:c] = by_all[:, f:, f:].sum(axis=0)
+        common[:c, :-1] = self.by_errors_and_sum(rest[:, :, :-1])[1]
+        common[:c, -1] = rest[:, :, -1].sum(axis=0)
         common[:, :c] = common[:c].T
         common[c:, c:] = fixed.T @ part.summed() @ fixed
-        return by_all[:, :f], common
+        return by_all, common
 
     def take(self, mask: Mask) -> "Gram":
         """The matrices of the sightings in a mask."""

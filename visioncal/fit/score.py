@@ -131,15 +131,16 @@ def products(fit: Fit, added: Iterable[Added], count: int) -> Products:
     with_errors = [np.zeros((len(body.stops), body.width, count)) for body in fit.mixed.bodies]
     for part in added:
         gram, f = part.gram, 6 * len(part.gram.flanges)
-        full = np.swapaxes(gram.by_unknowns(part.local[:, :, :-1]), 1, 2)
+        by_errors, common = gram.by_errors_and_sum(part.local[:, :, :-1])
         pull += part.local[:, :, -1].sum(axis=0)
         inner += part.inner
-        np.add.at(with_common, gram.columns, full[:, f:].sum(axis=0))
+        np.add.at(with_common, gram.columns, common.T)
         if f:
             at = body_with(fit.mixed.bodies, gram.flanges)
             body = fit.mixed.bodies[at]
             units = np.searchsorted(body.stops, gram.stops)
-            np.add.at(with_errors[at], (units[:, None], body.errors_of(gram.flanges)), full[:, :f])
+            rows = units[:, None], body.errors_of(gram.flanges)
+            np.add.at(with_errors[at], rows, np.swapaxes(by_errors, 1, 2))
     return Products(pull, inner, with_common, with_errors)
 
 
@@ -170,7 +171,7 @@ def added_by(fit: Fit, effect: Effect, pairs: Sequence[Pair] = ()) -> list[Added
     if isinstance(effect, Displacement):
         return added_by_displacements(fit, pairs, (effect,))
     added = []
-    for gram in _used(fit):
+    for gram, heads in fit.used_heads:
         if effect.place == "edge" and effect.frame in gram.by_effects:
             columns = effect.columns(gram.moments, np.ones(len(gram.rows)))
             first, moves = 0, gram.by_effects[effect.frame] @ columns
@@ -182,7 +183,7 @@ def added_by(fit: Fit, effect: Effect, pairs: Sequence[Pair] = ()) -> list[Added
         if gram.head < first + moves.shape[1]:
             continue
         rows = slice(first, first + moves.shape[1])
-        local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)[:, rows]
+        local = np.swapaxes(moves, 1, 2) @ heads[:, rows]
         inner = np.tensordot(local[:, :, rows], moves, ((0, 2), (0, 1)))
         added.append(Added(gram, local, inner))
     return added
@@ -330,9 +331,3 @@ def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, flo
 def _weight(fit: Fit, gram: Gram, part: int = 0) -> float:
     """Inverse variance of the noise of some sightings' rows."""
     return float(weights_at(fit.estimate.logs)[gram.parts[part].size])
-
-
-def _used(fit: Fit) -> list[Gram]:
-    """The sightings that the fit uses."""
-    kept = [(gram, fit.used[gram.rows]) for gram in fit.grams]
-    return [gram if mask.all() else gram.take(mask) for gram, mask in kept if mask.any()]
