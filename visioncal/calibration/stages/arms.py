@@ -8,7 +8,12 @@ import numpy as np
 
 from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.joints import MatchedJoints
-from visioncal.calibration.stages.kinematics import ASKED, SelectedArmLevel, select_errors
+from visioncal.calibration.stages.kinematics import (
+    ASKED,
+    LevelFit,
+    SelectedArmLevel,
+    select_errors,
+)
 from visioncal.calibration.stages.thermal import (
     HeatedStops,
     ThermalFit,
@@ -272,11 +277,13 @@ class RobotArm:
         noise: Noise,
         *,
         functions: bool = False,
+        nominal: LevelFit | None = None,
     ) -> Self:
         """Selects the errors of the arm's model by the data; see `select_errors`.
 
         The problem has this arm as reported; `views` has the view of each observation. With
         `functions` those of the joints are among them; where none are significant, the arm stays.
+        `nominal` is the fit of the nominal arm, where it is known.
         """
         used = self.at(stops_of(problem, self.robot))
         q, every = used.joints_rad, self.joints_rad
@@ -295,10 +302,11 @@ class RobotArm:
             harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
             waves = None if harmonics is None else self.by_stop(harmonics)
             kinematics = select_errors(
-                problem, start, self.robot, bases, model.torque_nm, level, noise, waves
+                problem, start, self.robot, bases, model.torque_nm, level, noise, waves, nominal
             )
             if kinematics is not None:
                 found_levels.append((kinematics, model))
+                nominal = kinematics.nominal
         if not found_levels:
             return self
         kinematics, model = max(found_levels, key=lambda pair: pair[0].fit.gain)

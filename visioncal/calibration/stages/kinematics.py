@@ -147,6 +147,7 @@ def select_errors(
     level: str,
     noise: Noise,
     harmonics: FloatArray | None,
+    nominal: LevelFit | None = None,
 ) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
 
@@ -162,6 +163,7 @@ def select_errors(
         level: A key of `ASKED`.
         noise: The noise's levels to start from.
         harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
+        nominal: The fit of the nominal arm, where it is known.
 
     Returns:
         The errors; with `harmonics` None where no functions of the joints are significant.
@@ -178,7 +180,7 @@ def select_errors(
                 )
         return None
 
-    def fitted(sizes: ArmSizes | None) -> LevelFit:
+    def fitted(sizes: ArmSizes | None, nominal: LevelFit) -> LevelFit:
         """The fit with errors of some sizes; the nominal one where it is no better."""
         with suppress(np.linalg.LinAlgError):
             fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else nominal
@@ -190,8 +192,8 @@ def select_errors(
         sizes = likely(ASKED[level])
         if harmonics is not None and sizes is None:
             return None
-        nominal = LevelFit.of(problem, state, robot, noise, None)
-        fit = fitted(sizes)
+        nominal = nominal or LevelFit.of(problem, state, robot, noise, None)
+        fit = fitted(sizes, nominal)
     return SelectedArmLevel(nominal, fit, level)
 
 

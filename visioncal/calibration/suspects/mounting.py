@@ -8,7 +8,7 @@ from visioncal.calibration.pipeline.arm_results import change_each
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
-from visioncal.calibration.stages.kinematics import SelectedArmLevel
+from visioncal.calibration.stages.kinematics import LevelFit, SelectedArmLevel
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
@@ -44,7 +44,8 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     size = float(np.linalg.norm(declared.gravity))
     for axis in size * np.concatenate([np.eye(3), -np.eye(3)]):
         is_stated = axis @ declared.gravity > 0.9 * size**2
-        level = None if is_stated else _level(run, arm, moved[:3, :3] @ axis)
+        nominal = tried[0][0].nominal if tried else None
+        level = None if is_stated else _level(run, arm, moved[:3, :3] @ axis, nominal)
         if level is not None:
             tried.append((level, axis))
     if not tried:
@@ -67,7 +68,9 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
     )
 
 
-def _level(run: RunState, arm: RobotArm, gravity: FloatArray) -> SelectedArmLevel | None:
+def _level(
+    run: RunState, arm: RobotArm, gravity: FloatArray, nominal_fit: LevelFit | None
+) -> SelectedArmLevel | None:
     """The errors of an arm with (3,) gravity in the base of its poses [m/s^2]."""
     cell_fit = run.cell_fit
 
@@ -79,7 +82,9 @@ def _level(run: RunState, arm: RobotArm, gravity: FloatArray) -> SelectedArmLeve
         document = {**robot.document, "gravity_m_s2": gravity.tolist()}
         robot = replace(robot, document=document, gravity=gravity)
         other = replace(other, matched=replace(matched, robot=robot), model=None)
-        return other.with_level(nominal, start, cell_fit.level, run.used, cell_fit.noise)
+        return other.with_level(
+            nominal, start, cell_fit.level, run.used, cell_fit.noise, nominal=nominal_fit
+        )
 
     return change_each(cell_fit.arms, cell_fit.fit, with_gravity)[arm.robot].kinematics
 
