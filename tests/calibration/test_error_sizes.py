@@ -14,10 +14,12 @@ from visioncal.calibration.stages.error_sizes import error_sizes, solve_session
 from visioncal.core.transforms import apply, invert, log
 from visioncal.estimation.moves import still_to_come
 from visioncal.fit import candidates
+from visioncal.model.boards import shape_basis
 from visioncal.model.effects import Named
 from visioncal.model.effects.effect import LensEffect
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
+from visioncal.vision.board_shape import board_basis
 from visioncal.vision.camera import project
 from visioncal.vision.lens_field import LensLevels, displacements
 from visioncal.vision.targets import corner_positions
@@ -67,6 +69,21 @@ def field_of(cell, size_px, rng):
             for seen in cell.corners
         ],
     )
+
+
+def test_frames_are_fitted_from_the_boards_and_lenses_of_the_one_likelihood():
+    cell = simulate(CellOptions(views=20, seed=4, board_scale=1.002, board_bow_m=1e-3))
+    known = estimate_lenses(known_of(cell, joints=True))
+    solved = solve_session(known)
+    sizes, (target,) = error_sizes(known, solved), known.session.boards.values()
+    ((frame, shape),) = sizes.shapes.items()
+    points = corner_positions(target)
+    by_likelihood = shape_basis(points) @ solved.fit.state.values["shape", frame]
+    assert np.ptp(by_likelihood[:, 2]) > 5e-4
+    assert np.allclose(board_basis(points) @ shape, by_likelihood, rtol=0.0, atol=1e-15)
+    assert {name: lens.matrix.tolist() for name, lens in sizes.cameras.items()} == {
+        name: solved.fit.camera(name).matrix.tolist() for name in known.cameras
+    }
 
 
 @pytest.mark.slow

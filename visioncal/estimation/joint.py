@@ -31,6 +31,9 @@ from visioncal.vision.corners import floored_sigma_px
 
 # Values that change by less than this share of their sigma have converged.
 _SETTLED = 0.02
+# Largest share of a step that the next one is taken to repeat: it bounds extrapolation.
+_MOST_SHARE = 0.6
+_TINY = float(np.finfo(float).tiny)
 # A step is halved while it increases the corner residuals by this factor.
 FOLLOWS = 2.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
@@ -71,11 +74,17 @@ def fit_jointly(
     """
     with diverging():
         fitted = _fitted(model, optics.linearised(), frames, others, model.noise)
+        last = np.zeros(len(fitted.linearised.free))
         for _ in range(8):
             sigma = np.sqrt(np.diag(fitted.absorbed)[fitted.lens_columns])
-            if np.all(np.abs(_change(fitted)) <= _SETTLED * sigma):
+            change = _change(fitted)
+            if np.all(np.abs(change) <= _SETTLED * sigma):
                 break
-            corners = _stepped(fitted)
+            # Large residuals let steps shrink slowly: what they sum to is taken (Aitken 1926).
+            steps = change / np.where(sigma > 0.0, sigma, np.inf)
+            share = float(np.clip(steps @ last / max(float(last @ last), _TINY), 0.0, _MOST_SHARE))
+            corners = _stepped(fitted, 1.0 / (1.0 - share))
+            last = np.zeros(len(steps)) if share > 0.0 else steps
             if corners is fitted.linearised:
                 raise np.linalg.LinAlgError("the corners follow no part of the step")
             previous = fitted
@@ -116,13 +125,13 @@ def _change(fitted: Fit) -> FloatArray:
     return fitted.state.values[: len(seen.free)] - seen.camera_parameters.values[seen.free]
 
 
-def _stepped(fitted: Fit) -> LinearisedCorners:
-    """Linearises the corners at the fitted values, or after a shorter step if they fit worse."""
+def _stepped(fitted: Fit, factor: float) -> LinearisedCorners:
+    """Linearises the corners after a step's multiple, or a shorter step if they fit worse."""
     # Far from the solution, as with a lens stated for another image size, the full step leads to
     # lenses that image nothing.
     limits = [FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
     optics, free = fitted.linearised.camera_parameters, fitted.linearised.free
-    change = _change(fitted)
+    change = factor * _change(fitted)
     for _ in range(12):
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2

@@ -30,7 +30,7 @@ from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import START_SIGMA, robot_likelihood
 
 # Relative decrease of the cost at convergence while the noise levels still change.
-_NEARLY = 1e-7
+_NEARLY = 1e-5
 # A well-posed fit converges within a few steps. One that creeps, such as along the flat valley of
 # arm errors that mimic another cause, gets new noise levels after this many.
 _STEPS = 30

@@ -21,5 +21,9 @@ def shape_basis(points: FloatArray, *, is_loose: bool = False) -> FloatArray:
     the board's pose. Loose corners are elsewhere in its plane, too [m].
     """
     basis = loose_basis(points, is_loose=is_loose)
-    others = range(SHAPES, basis.shape[2])
-    return basis[:, :, [SCALE, ASPECT, SHEAR, *range(2, 9), *others]]
+    return basis[:, :, shape_order(basis.shape[2])]
+
+
+def shape_order(count: int) -> list[int]:
+    """The index of each of s values of a board's shape among those of `loose_basis`."""
+    return [SCALE, ASPECT, SHEAR, *range(2, 9), *range(SHAPES, count)]

@@ -21,8 +21,8 @@ from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
-from visioncal.estimation.unknowns import BOARD
-from visioncal.vision.board_shape import SCALE
+from visioncal.estimation.unknowns import BOARD, LENS
+from visioncal.vision.camera import intrinsics
 from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.targets import corner_positions
 
@@ -138,7 +138,7 @@ class CellFit:
     ) -> CameraParameters:
         """The corners of scenes and views (by camera frame), with stated lenses and boards.
 
-        They have the `sizes` of errors. Boards start at the size that the one likelihood has.
+        They have the `sizes` of errors. Free values start where the one likelihood has them.
         """
         shares, sizes, problems, poses = self._shares, self.sizes, {}, {}
         stops = self.inlier_fit.problem.observations.stops.tolist()
@@ -161,14 +161,16 @@ class CellFit:
             with_corners = [view for view in views[frame] if view.view in corners]
             poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
         stated = CameraParameters.of(problems, poses)
-        starts = {
-            stated.parts[BOARD, name].start + SCALE: sizes.scales[frame]
-            for scene in scenes.values()
-            for name in scene.printed
-            if (frame := self.cell.session.board_frames[name]) in sizes.scales
-            and not sizes.boards.get(name, BoardSizes()).is_held
-        }
-        return stated.with_values(np.array([*starts], dtype=np.int64), np.array([*starts.values()]))
+        values = stated.values.copy()
+        for frame, lens in sizes.cameras.items():
+            if frame in problems:
+                values[stated.parts[LENS, frame]] = intrinsics(lens)
+        for name in next(iter(scenes.values())).printed:
+            shape = sizes.shapes.get(self.cell.session.board_frames[name])
+            if shape is not None:
+                values[stated.parts[BOARD, name]] = shape
+        free = stated.free[~np.isin(stated.free, stated.held)]
+        return stated.with_values(free, values[free])
 
     @property
     def _shares(self) -> dict[int, float]:

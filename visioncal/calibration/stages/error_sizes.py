@@ -17,6 +17,7 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
+from visioncal.model.boards import shape_order
 from visioncal.model.effects import EFFECTS, Displacement, Effect, LensGrows, LensSteps, Named
 from visioncal.model.effects.effect import LensEffect
 from visioncal.session import frame_name
@@ -80,8 +81,9 @@ class ErrorSizes:
     opened: tuple[OpenedEffect, ...] = ()  # Those that findings name.
     displaced: tuple[Displaced, ...] = ()  # By panes before lenses, and boards that swell.
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
-    # Shares by which boards are larger than stated, by frame: where their fit starts.
-    scales: Mapping[str, float] = field(default_factory=dict)
+    # Where a fit of poses starts: (s,) shapes of boards by frame, see `shape_basis`, and lenses.
+    shapes: Mapping[str, FloatArray] = field(default_factory=dict)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def steadied(
         self,
@@ -166,8 +168,14 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         if abs(zoom.share) > grew.get(name, 0.0):
             zoomed[name], grew[name] = zoom, abs(zoom.share)
     displaced = tuple(_displaced(fit))
-    known = _opened(fit), displaced, fit.unknowns.rivals, scales_of(solved)
-    return ErrorSizes(levels, lenses, boards, grown, zoomed, *known)
+    known = _opened(fit), displaced, fit.unknowns.rivals
+    shapes = {
+        key[1]: values[np.argsort(shape_order(len(values)))]
+        for key, values in fit.state.values.items()
+        if key[0] == "shape"
+    }
+    cameras = {name: fit.camera(name) for name in fit.unknowns.lenses}
+    return ErrorSizes(levels, lenses, boards, grown, zoomed, *known, shapes, cameras)
 
 
 def scales_of(solved: CellFit | None) -> dict[str, float]:

@@ -7,6 +7,7 @@ have, without a pattern, and where no other cause does about as well. The others
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -62,6 +63,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     Errors of arms follow the posture beside all that the fit has: of a misfit that a cure there
     clearly removes, they explain what it leaves.
     """
+    # Findings of several cameras have one trial.
+    trial_of, is_proof = cache(lambda kind: _TRIALS[kind](run, kind)), cache(partial(_proves, run))
     by_arms, rest, found = list[Finding](), 1.0, [*found]
     by_lens = max((at.mahalanobis_sq for at in found if at.kind in _OF_LENSES), default=0.0)
     is_stepped, is_creeping = False, any(finding.kind in _CREEPS for finding in found)
@@ -76,7 +79,7 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         if finding.kind not in _TRIALS or not finding.until_mm or is_held:
             yield finding
             continue
-        trial = _TRIALS[finding.kind](run, finding.kind)
+        trial = trial_of(finding.kind)
         before, after = (mm_and_deg(*at) for at in trial.levels.tolist())
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
@@ -91,7 +94,7 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             rest = min(rest, 1.0 - share)
         # Of what no view distinguishes, no cure proves one.
         is_proven = bool(finding.mahalanobis_sq) and not finding.rivals
-        is_proven, instead = is_proven and _proves(run, trial), tuple[str, ...]()
+        is_proven, instead = is_proven and is_proof(trial), tuple[str, ...]()
         if finding.kind in KINDS:
             # The fit here knows of a lens what the one likelihood of all corners found, which is no
             # rival's: there they were tried.
