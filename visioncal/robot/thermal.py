@@ -301,6 +301,11 @@ class OnlineCompensator:
             raise DataError("thermal: the compensator has no sample yet.")
         return self._state
 
+    @property
+    def robot(self) -> Robot:
+        """Current model of the arm."""
+        return self._model.robot_at(self.links_c)
+
     def base_from_flange(self, q: FloatArray) -> FloatArray:
         """Current flange poses (m, 4, 4) at (m, n) joint angles [rad]."""
         return self._model.base_from_flange(q, self.links_c)
