@@ -12,7 +12,9 @@ import visioncal
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses
 from visioncal.calibration.stages.error_sizes import error_sizes, solve_session
 from visioncal.core.transforms import apply, invert, log
+from visioncal.estimation import joint
 from visioncal.estimation.moves import still_to_come
+from visioncal.estimation.unknowns import LENS
 from visioncal.fit import candidates
 from visioncal.model.boards import shape_basis
 from visioncal.model.effects import Named
@@ -84,6 +86,26 @@ def test_frames_are_fitted_from_the_boards_and_lenses_of_the_one_likelihood():
     assert {name: lens.matrix.tolist() for name, lens in sizes.cameras.items()} == {
         name: solved.fit.camera(name).matrix.tolist() for name in known.cameras
     }
+
+
+def test_lens_and_frames_come_to_rest_beside_residuals_of_pixels(monkeypatch):
+    # Steps of the lens shrink by a fifth each beside three pixels that no lens of its model has.
+    cell = simulate(CellOptions(views=14, seed=600, state_intrinsics=False))
+    rng = np.random.default_rng(0)
+    warped = []
+    for seen in cell.corners:
+        u, v = ((seen.px - [640.0, 400.0]) / 640.0).T
+        warp = 3.0 * np.stack([np.sin(5 * u + 3 * v), np.cos(4 * v - 2 * u)], axis=1)
+        warped.append(replace(seen, px=seen.px + warp + rng.normal(0.0, 0.5, seen.px.shape)))
+    ends = []
+    for rounds in (joint._ROUNDS, 4 * joint._ROUNDS):
+        monkeypatch.setattr(joint, "_ROUNDS", rounds)
+        fit = calibrated(showing(cell, warped), joints=False).cell_fit.fit
+        ends.append((fit.values((LENS, "cam")), fit.frames["cam"]))
+    moved = np.abs(ends[0][0] - ends[1][0])[:4] / fit.sigmas((LENS, "cam"))[:4]
+    # Steps of less than a fiftieth of a sigma, which halve, end it.
+    assert moved.max() < 0.1
+    assert np.allclose(ends[0][1], ends[1][1], rtol=0.0, atol=1e-5)
 
 
 @pytest.mark.slow

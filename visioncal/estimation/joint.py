@@ -32,7 +32,10 @@ from visioncal.vision.corners import floored_sigma_px
 # Values that change by less than this share of their sigma have converged.
 _SETTLED = 0.02
 # Largest share of a step that the next one is taken to repeat: it bounds extrapolation.
-_MOST_SHARE = 0.6
+_MOST_SHARE = 0.75
+# Most linearisations: a lens of another model leaves residuals beside which steps shrink by a
+# quarter each.
+_ROUNDS = 40
 _TINY = float(np.finfo(float).tiny)
 # A step is halved while it increases the corner residuals by this factor.
 FOLLOWS = 2.0
@@ -75,7 +78,7 @@ def fit_jointly(
     with diverging():
         fitted = _fitted(model, optics.linearised(), frames, others, model.noise)
         last = np.zeros(len(fitted.linearised.free))
-        for _ in range(8):
+        for _ in range(_ROUNDS):
             sigma = np.sqrt(np.diag(fitted.absorbed)[fitted.lens_columns])
             change = _change(fitted)
             if np.all(np.abs(change) <= _SETTLED * sigma):
