@@ -36,10 +36,7 @@ def test_joints_come_from_where_they_moved_last():
     arm = Arm("flange", poses, joints)
     # From below where it rose; nothing is known of the first stop, nor of one without a pose.
     assert arm.sides.tolist() == [[0, 0], [-1, 1], [-1, 1], [0, 0], [1, -1]]
-    stated = replace(
-        Loads.alike(5, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        side=np.array([1.0, -1.0, 0.0, 0.0, 1.0]),
-    )
+    stated = replace(Loads.none(5), side=np.array([1.0, -1.0, 0.0, 0.0, 1.0]))
     loaded = replace(arm, loads=stated)
     assert loaded.sides[:, 1].tolist() == [1, -1, 0, 0, 1]
 

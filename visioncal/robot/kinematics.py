@@ -20,6 +20,9 @@ _USUAL_TIPS = ("tool0", "flange")
 # thousand.
 _MOST_JOINTS = 2000
 
+# Advice where no tip is known.
+_NAME_TIP = "Name the frame of the reported poses as tip in [robot], or to convert as --tip."
+
 
 class UrdfArm(NamedTuple):
     """The arm of a URDF from its root to the tip; masses are None where it states none."""
@@ -75,7 +78,7 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
         raise DataError(
             f"{table.label}: no joint lies between the URDF's root and {tip}.",
             culprits=[f"{table.label}: tip"],
-            next_step="Name the frame of the reported poses with --tip, or as tip in [robot].",
+            next_step=_NAME_TIP,
         )
     others = [joint for joint in range(1, model.njoints) if joint not in arm_joints]
     arm = pin.buildReducedModel(model, others, pin.neutral(model))
@@ -131,6 +134,5 @@ def _find_tip(table: DocumentTable, frames: list[str]) -> str:
     raise DataError(
         f"{table.label}: the URDF {what}; its frames are {links}.",
         culprits=[f"{table.label}: tip"],
-        next_step=f"{did_you_mean(tip, frames)} Name the frame of the reported poses with --tip, "
-        "or as tip in [robot].".strip(),
+        next_step=f"{did_you_mean(tip, frames)} {_NAME_TIP}".strip(),
     )

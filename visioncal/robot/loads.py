@@ -53,6 +53,11 @@ class Loads:
     side: FloatArray
 
     @classmethod
+    def none(cls, count: int) -> Self:
+        """No loads but the arm's own weight."""
+        return cls.alike(count, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    @classmethod
     @typed
     def alike(
         cls,

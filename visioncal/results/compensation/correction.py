@@ -12,7 +12,7 @@ from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import compose, nearest_rotation, rigid_fault
+from visioncal.core.transforms import compose, invert, nearest_rotation, rigid_fault, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.results import Calibration
 from visioncal.results.arm import ArmResult, WorkspacePlace
@@ -230,6 +230,11 @@ class Corrected:
         """(m,) distance between commanded and wanted flange position [m]."""
         shift = self.base_from_flange[:, :3, 3] - self.wanted[:, :3, 3]
         return np.asarray(np.linalg.norm(shift, axis=1))
+
+    @property
+    def moved_rad(self) -> FloatArray:
+        """(m,) angle between commanded and wanted orientation [rad]."""
+        return rotation_angle(invert(self.wanted) @ self.base_from_flange)
 
 
 @typed
