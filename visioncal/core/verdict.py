@@ -284,7 +284,8 @@ class Verdict:
         how = "Also likely" if finding.probability >= _EVEN else "Possibly"
         if finding in self.causes[:1]:
             others = [cause for cause in self.causes[1:] if cause.probability >= LEAST_LIKELY]
-            is_open = bool(others) or LEFT_OPEN in finding.words
+            # A stored verdict has its rivals in its words alone.
+            is_open = bool(others or finding.rivals) or LEFT_OPEN in finding.words
             is_even = finding.probability > 0.9 * _EVEN
             how = "Most likely" if is_even or not finding.by_limit else how
             how = "Likeliest of these" if finding.by_limit and is_open else how
