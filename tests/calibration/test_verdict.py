@@ -49,7 +49,7 @@ from visioncal.core.verdict import (
     remarks,
     with_paths,
 )
-from visioncal.estimation.joint import MeasuredScale
+from visioncal.estimation.joint import MeasuredScale, size_of_measured
 from visioncal.estimation.unknowns import LENS
 from visioncal.interchange.formats.mending import remove_tool
 from visioncal.model.effects import Window
@@ -622,6 +622,20 @@ def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     found = ids(calibrate(session_of(cell, flange)).verdict)
     assert "something_moved" not in found
     assert "wrong_views" in found
+
+
+@pytest.mark.parametrize(("sigma", "is_another"), [(0.002, True), (0.0099, False), (0.02, False)])
+def test_a_size_of_which_the_motion_says_less_than_the_prior_is_as_stated(sigma, is_another):
+    """Errors that last from view to view may leave it less sure than its prior alone."""
+    prior = SimpleNamespace(information=np.array([[0.01**-2.0]]))
+    fitted = SimpleNamespace(
+        problem=SimpleNamespace(effects=[SimpleNamespace(name="size", prior=prior)]),
+        values=lambda _: np.array([-0.02]),
+        sigmas=lambda _: np.array([sigma]),
+    )
+    measured = size_of_measured(SimpleNamespace(has_links=False), fitted)
+    assert measured.is_another == is_another
+    assert measured.contradicts == is_another
 
 
 @pytest.mark.slow

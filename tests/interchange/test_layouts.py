@@ -2141,6 +2141,29 @@ def test_a_tip_of_no_usual_name_is_that_of_the_arm_that_is_named(tmp_path):
     assert Session.load(tmp_path / "out").views[0].joints_rad == pytest.approx(rows[0, :3])
 
 
+@pytest.mark.parametrize("ending", [".txt", ".mat"])
+def test_matrices_as_programs_print_them_alone_are_poses(tmp_path, ending):
+    """Those of OpenCV, whose rows end with semicolons, and the text that MATLAB saves."""
+    robot, names = np.array(world()[0]), {"hand": 0, "eye": 1}
+    sides = [robot, np.array([view.cam_from_target().as_matrix() for view in world()[2].views])]
+    for name, side in names.items():
+        if ending == ".mat":
+            text = "\n".join(
+                "  ".join(f"{value: .16e}" for value in seven(pose)) for pose in sides[side]
+            )
+        else:
+            rows = (
+                ";\n ".join(", ".join(map(repr, row)) for row in pose.tolist())
+                for pose in sides[side]
+            )
+            text = "\n".join(f"[{each}]" for each in rows)
+        write(tmp_path / f"in/{name}{ending}", text)
+    visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand").good()
+    views = Session.load(tmp_path / "out").views
+    found = np.array([view.base_from_flange().as_matrix() for view in views])
+    np.testing.assert_allclose(found, robot, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_images_are_searched_once_where_few_rows_decide_nothing(tmp_path, monkeypatch):
     session = world()[2]

@@ -247,7 +247,10 @@ def size_of_measured(model: FrameModel, fitted: Fit) -> MeasuredScale | None:
     for effect in fitted.problem.effects:
         if effect.name == SIZE:
             scale, total = fitted.values((SIZE, ""))[0], fitted.sigmas((SIZE, ""))[0] ** -2.0
-            by_motion = max(float(total - effect.prior.information[0, 0]), 1e-12)
+            by_motion = float(total - effect.prior.information[0, 0])
+            if 2.0 * by_motion < total:
+                # Beside errors that last, the motion says less than the prior.
+                return MeasuredScale(0.0, np.inf, DEFAULT_RELATIVE_SIGMA)
             sigma = (UNEVEN_LINKS if model.has_links else 1.0) * by_motion**-0.5
             return MeasuredScale(float(scale * total) / by_motion, sigma, DEFAULT_RELATIVE_SIGMA)
     return None

@@ -65,6 +65,10 @@ def _stops(lines: _Lines) -> list[_Lines]:
     begin them, as those do that stand beside numbers.
     """
     inner = [_numbers_in(line) for _, line in lines]
+    sizes = {len(numbers) for _, numbers in inner}
+    if len(sizes) == 1 and sizes <= {*POSE_SIZES}:
+        # Lists alone, one a stop.
+        return [[line] for line in lines]
     marked = (is_marked_pose(line) for _, line in lines)
     counts = np.array(
         [6 if is_pose else len(n) for is_pose, (_, n) in zip(marked, inner, strict=True)]

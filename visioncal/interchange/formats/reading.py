@@ -178,9 +178,19 @@ def _in_line(record: object) -> list[float]:
 
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml", ".npz", ".npy", ".mat", ".toml", *KEYED)
+_NUMBERS = re.compile(rb"[-+.eE\d\s]+")
 # Files of makers' controllers, and the forms of their poses.
 _MAKERS = {".jbi": "yaskawa", ".pts": "epson", ".dtx": "staubli"}
 ENDINGS = (".csv", ".tsv", ".txt", ".log", ".jsonl", *PROGRAMS, *_MAKERS, *DOCUMENTS)
+
+
+def is_document(path: Path) -> bool:
+    """Whether a file is a document, and no text of rows alone, as of MATLAB's `save -ascii`."""
+    suffix = path.suffix.lower()
+    if suffix == ".mat" and path.is_file():
+        with path.open("rb") as file:
+            return _NUMBERS.fullmatch(file.read(64)) is None
+    return suffix in DOCUMENTS
 
 
 def read_fields(path: Path, form: str | None = None) -> Fields:
@@ -198,7 +208,7 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
 
 
 def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
-    if path.suffix.lower() in DOCUMENTS:
+    if is_document(path):
         return rows_of_document(document or read_document(path), path)
     text = read_plain_text(path)
     if text.lstrip().startswith("<?xml"):
@@ -221,11 +231,21 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     moves = None if is_program else script_poses(text, path)
     if lines := moves or pendant_poses(text, path, form if form in POSE_FORMS else None):
         return [replace(lines, notes=tool_note(text, path))]
+    return [_of_lines(text, path)]
+
+
+def _of_lines(text: str, path: Path) -> Fields:
+    """The rows of a table, or of lists over several lines."""
+    lines = placed(text, path)
+    # Lists over several lines, as OpenCV prints a matrix.
+    is_wrapped = text.lstrip().startswith("[") and len(closed(lines)) < len(lines)
+    if is_wrapped and (blocks := blocks_of(lines, path)):
+        return blocks
     try:
         table = _of_joints(read_table(path, text), path)
     except DataError:
-        if blocks := blocks_of(placed(text, path), path):
-            return [blocks]
+        if blocks := blocks_of(lines, path):
+            return blocks
         raise
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
         raise DataError(
@@ -234,7 +254,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
             next_step="Convert the folder.",
         )
     if found := _stacked_matrices(table, path) or paired_rows(table, path):
-        return [found]
+        return found
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     places = [table.place(index) for index in range(len(table.rows))]
     fields = _named_joints(fields_of_records(records, places, path.stem, path.parent))
@@ -242,14 +262,14 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     is_odd = 2 * len(fields.numbers) < len(table.columns)
     pictured = IMAGE.search(text.splitlines()[table.lines[0] - 1])
     is_odd |= pictured is not None and not any(map(is_image_name, table.rows[0]))
-    blocks = blocks_of(placed(text, path), path) if is_odd and not table.has_header else None
+    blocks = blocks_of(lines, path) if is_odd and not table.has_header else None
     arrays = blocks.numbers.values() if blocks else ()
-    return [blocks if blocks and any(n[0].size in POSE_SIZES for n in arrays) else fields]
+    return blocks if blocks and any(n[0].size in POSE_SIZES for n in arrays) else fields
 
 
 def read_record(path: Path, document: object = None) -> dict[str, object]:
     """Content of the file of one view, by name; numbers without a name are its `matrix`."""
-    if path.suffix.lower() in DOCUMENTS:
+    if is_document(path):
         document = document or read_document(path)
     elif called := CALLED.fullmatch(text := read_plain_text(path)):
         document = {"matrix": parse_yaml(called[1], str(path))}

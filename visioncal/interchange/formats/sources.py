@@ -47,7 +47,7 @@ from visioncal.interchange.formats.poses import (
     ranked_poses,
     without_copies,
 )
-from visioncal.interchange.formats.reading import DOCUMENTS, read_record, read_rows
+from visioncal.interchange.formats.reading import is_document, read_record, read_rows
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 
@@ -236,10 +236,11 @@ def _part(group: FileGroup, form: str | None) -> Part:
         return Part(group)
     first, *others = group.files
     lenses: dict[str, Mapping[str, Any]] = {}
-    is_document = first.suffix.lower() in DOCUMENTS
     try:
-        document = read_document(first) if is_document else None
-        lenses = dict(lenses_in(document, group.label)) if is_document else _printed_lens(group)
+        document = read_document(first) if is_document(first) else None
+        lenses = (
+            _printed_lens(group) if document is None else dict(lenses_in(document, group.label))
+        )
         if not others:
             rows = joined(read_rows(first, form, document), first.stem, first.parent)
             return Part(group, tuple(rows), lenses=lenses)
