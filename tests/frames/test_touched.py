@@ -634,6 +634,22 @@ def test_the_rows_of_a_session_are_touches(tmp_path):
     assert tool["source"] == "touches"
 
 
+def test_tables_of_a_touch_each_are_touches(tmp_path):
+    """As of a program that writes a file each time; of a session in there the folder is named."""
+    poses, folder = touched(Job(), 12).touches.base_from_flange, tmp_path / "touches"
+    folder.mkdir()
+    for at, pose in enumerate(poses):
+        turns = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        row = [*(1e3 * pose[:3, 3]), *turns]
+        write_table(folder / f"touch_{at}.csv", ("x_mm", "y_mm", "z_mm", "rx", "ry", "rz"), [row])
+    tool = found(visioncal("tcp", folder, "--robot-form", "ur", "--json"))
+    assert off_mm(tool) < NEAR_MM
+    assert len(tool["observations"]) == len(poses)
+    (folder / "cell").mkdir()
+    (folder / "cell/session.toml").write_text("schema = 1")
+    visioncal("tcp", folder).refused("Name the session's folder")
+
+
 # --- What is wrong is named.
 
 

@@ -24,6 +24,7 @@ from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import NO_TOOL, Tool
 from visioncal.interchange.formats.touches import (
+    is_session,
     read_nominal,
     read_point_pairs,
     read_touches,
@@ -256,7 +257,7 @@ def _check_paths(request: FrameOptions, cad: Path | None, needs_tool: bool) -> N
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:
     """Loads a session whose images are to place something; None where it has none."""
-    if not source.is_dir() and source.suffix.lower() != ".rrd":
+    if not is_session(source):
         return None
     session = Session.load(source)
     shown = [view.number for view in session.views if view.image or view.has_corners]

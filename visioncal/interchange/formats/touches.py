@@ -17,7 +17,7 @@ from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptio
 from visioncal.interchange.formats.pose_forms import check_radians, poses_from
 from visioncal.interchange.formats.pose_words import words_of
 from visioncal.interchange.formats.poses import columns_named, pose_names
-from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.reading import best_of, read_fields
 from visioncal.interchange.formats.sources import describe, rows_in
 from visioncal.interchange.formats.unread import point_pairs
 from visioncal.session import Session
@@ -34,7 +34,7 @@ def read_touches(
 
     Args:
         path: A table with the columns of views.csv, `kind` and `point`, of which only the pose or
-            the joints are required; or a session, whose rows have them.
+            the joints are required; a folder of such tables, or a session, whose rows have them.
         requested: Convention of poses and joints, where the columns do not show it.
         robot: Which robot of a cell is meant, where a session or a column `robot` has several.
         positions: Whether a table without rotations is accepted: x_m, y_m, z_m, or x, y, z with the
@@ -43,10 +43,10 @@ def read_touches(
     Raises:
         DataError: It cannot be read, or a row is no pose.
     """
-    if path.is_dir() or path.suffix.lower() == ".rrd":
+    if is_session(path):
         return touches_of(Session.load(path), robot)
     given, joints_rad, written = requested.robot, None, None
-    fields = _of_robot(read_fields(path, given.form or given.usual), robot)
+    fields = _of_robot(_read(path, given.form or given.usual), robot)
     named = pose_names(fields, given.names, "robot", (), by_shape=False)
     if positions and (not named or (given.names and len(named) == 3)):
         maker = POSE_FORMS.get(given.form or "")
@@ -73,6 +73,23 @@ def read_touches(
     kinds, points = (texts.get(name, ("",) * len(fields)) for name in ("kind", "point"))
     labels = tuple(map(str, numbers))
     return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points, written)
+
+
+def is_session(path: Path) -> bool:
+    """Whether touches are a session's rows: a recording, or a folder but of tables alone."""
+    return path.suffix.lower() == ".rrd" or (path.is_dir() and not _tables_in(path))
+
+
+def _tables_in(folder: Path, form: str | None = None) -> list[Fields]:
+    """Rows of the tables in a folder that is no session and has no images, as of a touch each."""
+    if any(file for at in ("", "*/") for file in folder.glob(f"{at}session.toml")):
+        return []
+    source = describe(folder, form)
+    return [] if source.images else rows_in(source)
+
+
+def _read(path: Path, form: str | None = None) -> Fields:
+    return best_of(_tables_in(path, form)) if path.is_dir() else read_fields(path, form)
 
 
 def read_point_pairs(path: Path) -> tuple[TouchRows, NominalPoints] | None:
@@ -122,10 +139,10 @@ def robots_of(path: Path) -> tuple[str, ...]:
     Raises:
         DataError: A session cannot be read.
     """
-    if path.is_dir() or path.suffix.lower() == ".rrd":
+    if is_session(path):
         return tuple(filter(None, Session.load(path).robots))
     with suppress(DataError):
-        return tuple(filter(None, dict.fromkeys(read_fields(path).texts.get("robot", ()))))
+        return tuple(filter(None, dict.fromkeys(_read(path).texts.get("robot", ()))))
     # A pendant's lines name none, whosever form they are in.
     return ()
 
