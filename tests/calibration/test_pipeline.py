@@ -554,6 +554,18 @@ def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_pat
     assert said == pytest.approx(factor, abs=0.05 * abs(1.0 - scale))
 
 
+def test_a_board_of_quite_another_size_is_as_large_as_the_fit_says():
+    """Poses of single images find another reading, of a size that would be held as stated."""
+    options = CellOptions(views=12, board_scale=0.8, seed=3, pixel_sigma_px=0.05)
+    verdict = calibrate(cell_session(simulate(options), "cell", seen="corners")).verdict
+    named, *_ = verdict.causes
+    assert named.kind == "board_size"
+    # Four sigmas of 12 views of an arm that repeats to 0.1 mm.
+    factor = float(re.search(r"--board-scale ([\d.]+)", named.do.command)[1])
+    assert factor == pytest.approx(0.8, rel=4e-4)
+    assert not any(finding.kind == "misread_poses" for finding in verdict.findings)
+
+
 @pytest.mark.slow
 def test_an_arm_that_is_off_is_no_other_scale():
     arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3))

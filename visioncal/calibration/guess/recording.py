@@ -112,6 +112,13 @@ class Candidate:
         )
 
     @property
+    def is_of_size(self) -> bool:
+        """Whether it changes the size of what the camera sees, and nothing else."""
+        found, declared = self.hypothesis, self.recording.declared
+        scale = declared.camera.scale
+        return replace(found, camera=replace(found.camera, scale=scale)) == declared
+
+    @property
     def rows_apart(self) -> int:
         """Rows by which all views' poses stand later, where nothing else is read otherwise."""
         found, declared = self.hypothesis, self.recording.declared

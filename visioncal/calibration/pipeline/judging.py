@@ -46,7 +46,7 @@ def judge_run(state: RunState) -> RunState:
     verdict = judge(findings)
     # Exchanged rows show themselves; other poses that are misread explain what follows.
     if verdict.status != "good" and [cause.kind for cause in verdict.causes[:1]] != [EXCHANGED]:
-        state = with_misreading(state)
+        state = with_misreading(replace(state, warnings=tuple(findings.warnings)))
         if state.misread:
             rest = (found for found in findings.warnings if found.kind not in BY_CHAIN)
             findings = replace(findings, warnings=(*state.misread, *rest))

@@ -114,10 +114,11 @@ def _status_of(doubts: Sequence[Finding], met: NeedMet | None) -> VerdictStatus:
 def in_reading_order(findings: Sequence[Finding], status: VerdictStatus) -> tuple[Finding, ...]:
     """Missing images, the likeliest cause, its cost, other likely causes, then the rest."""
 
-    def by_likelihood(finding: Finding) -> tuple[float, int, bool, float]:
-        # Of what is as good as certain, a cure that was tried precedes what merely passes a limit.
-        most = -finding.probability
-        return max(most, -SURE), SUSPECTS[finding.kind].order, finding.by_limit, most
+    def by_likelihood(finding: Finding) -> tuple[float, int, bool, bool, float]:
+        # Of what is as good as certain, a cure that was tried precedes what merely passes a limit,
+        # and one that clearly lowers the misfit all others.
+        most, order = -finding.probability, SUSPECTS[finding.kind].order
+        return max(most, -SURE), order, finding.by_limit, not finding.is_apart, most
 
     likely = (finding for finding in findings if finding.probability >= LEAST_LIKELY)
     causes = sorted(likely, key=by_likelihood)

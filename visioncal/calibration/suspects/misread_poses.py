@@ -255,6 +255,9 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
         return
+    if guess.best.is_of_size and any(found.kind == "board_size" for found in run.warnings):
+        # The fit's own size is the more precise one.
+        return
     # A reading that closes it roughly does not precede columns that close it to the noise.
     if apart := [*of_other_rows(run, guess.best.fit.score)]:
         yield from apart

@@ -368,7 +368,7 @@ def _untested(
     """
     other = fault.finding if isinstance(fault, OtherBoardError) else None
     needs_form = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
-    if needs_form and other is not None and other.kind == "other_board":
+    if other is not None and other.kind == "other_board":
         raise DataError(
             other.words,
             culprits=["--target"],
