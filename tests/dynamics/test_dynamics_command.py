@@ -101,6 +101,14 @@ def test_wrong_options_are_named(folder, arguments, words):
     visioncal("dynamics", "identify", folder, *arguments).refused(words)
 
 
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_a_table_of_torques_alone_is_answered_with_its_place(tmp_path, is_folder):
+    (tmp_path / "log.csv").write_text("time,q0,tau0\n0.0,0.1,2.5\n0.1,0.2,2.4\n")
+    source = tmp_path if is_folder else tmp_path / "log.csv"
+    done = visioncal("dynamics", "identify", source, "--robot", "ur5e")
+    assert "pictures" not in done.refused("streams/NAME.csv", "stamp_s, q1_rad").said
+
+
 def test_a_session_without_torques_or_robot_is_named(folder, tmp_path):
     session = Session.load(folder)
     kept = [name for name in session.streams["fresh"].columns if not name.startswith("tau")]

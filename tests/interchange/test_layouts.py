@@ -2164,6 +2164,23 @@ def test_matrices_as_programs_print_them_alone_are_poses(tmp_path, ending):
     np.testing.assert_allclose(found, robot, atol=1e-12)
 
 
+@pytest.mark.parametrize(("turn", "words"), [([2, 0, 1], "along the camera's x"), ([0, 1, 2], "")])
+def test_targets_beside_the_axis_of_a_lens_are_noted(tmp_path, turn, words):
+    """As of poses in camera_link, whose x is a lens's z."""
+    seen = np.array([view.cam_from_target().as_matrix() for view in world()[2].views])
+    rows = [
+        [*seven(a), *seven(np.eye(4)[[*turn, 3]] @ b)]
+        for a, b in zip(world()[0], seen, strict=True)
+    ]
+    names = [f"{s}_{n}" for s in ("robot", "cam") for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    write_table(tmp_path / "log.csv", names, np.array(rows))
+    said = ("--mount", "eye-in-hand", "--robot-columns", ",".join(names[:7]))
+    said = (*said, "--camera-columns", ",".join(names[7:]))
+    done = visioncal("convert", tmp_path / "log.csv", tmp_path / "out", *said).good()
+    assert ("The targets stand" in done.err) == bool(words)
+    assert words in done.err
+
+
 @pytest.mark.slow
 def test_images_are_searched_once_where_few_rows_decide_nothing(tmp_path, monkeypatch):
     session = world()[2]

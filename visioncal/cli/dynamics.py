@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import typer
@@ -199,6 +200,21 @@ def _requested(streams: StreamOptions) -> IdentificationRequest:
     )
 
 
+def _session(path: Path) -> Session:
+    """Loads a session; tables that are none are answered with where they belong."""
+    folder = path.parent if path.is_file() else path
+    files = (file for at in ("", "*/") for file in folder.glob(f"{at}session.toml"))
+    if path.exists() and path.suffix.lower() != ".rrd" and not any(files):
+        raise DataError(
+            f"{path} must be a session with streams of angles and torques.",
+            culprits=[str(path)],
+            next_step="Write each motion as streams/NAME.csv in a session's folder, with columns "
+            "stamp_s, q1_rad ..., tau1_nm ... and, where it is recorded, dq1_rad_s ..., beside a "
+            "session.toml with schema = 1, name, and model in [robot].",
+        )
+    return Session.load(path)
+
+
 def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
     """Identifies the dynamics from a session's streams, and writes and reports them."""
     request = replace(
@@ -211,7 +227,7 @@ def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
             checked=not options.unchecked,
         ),
     )
-    run = identify_session(Session.load(options.session), request)
+    run = identify_session(_session(options.session), request)
     identified = run.identified
     written = Written(()) if options.output is None else write_dynamics(options.output, run)
     if options.as_json:
@@ -226,7 +242,7 @@ def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
 def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
     """Predicts the torques of a session's streams, and prints the prediction errors."""
     identified = Identified.load(options.against)
-    streams = conditioned_streams(Session.load(options.session), identified, _requested(options))
+    streams = conditioned_streams(_session(options.session), identified, _requested(options))
     predictions = [predict(identified, stream) for stream in streams]
     validations = [validate(identified, prediction) for prediction in predictions]
     worst = max(float(validation.shares.max()) for validation in validations)
@@ -300,7 +316,7 @@ def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
 def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
     """Estimates the payload, and prints it."""
     identified = Identified.load(options.against)
-    loaded = conditioned_streams(Session.load(options.session), identified, _requested(options))
+    loaded = conditioned_streams(_session(options.session), identified, _requested(options))
     payload = estimate_payload(
         identified,
         loaded,
@@ -351,11 +367,11 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
             next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
             "for a body as small as a point.",
         )
-    without = select_arm(Session.load(options.session), options.named)
+    without = select_arm(_session(options.session), options.named)
     robot = robot_of(without)
     empty = current_streams(without, robot, options.cutoff_hz)
     full = current_streams(
-        select_arm(Session.load(options.loaded), options.named),
+        select_arm(_session(options.loaded), options.named),
         robot,
         options.cutoff_hz or empty[0].cutoff_hz,
     )

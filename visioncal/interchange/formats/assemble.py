@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -18,7 +18,7 @@ from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
-from visioncal.core.types import Mount, Searched
+from visioncal.core.types import MOUNTS, Mount, Searched
 from visioncal.interchange.formats.fields import named_by
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions, rows_of
 from visioncal.interchange.formats.intrinsics import read_intrinsics, read_target_description
@@ -187,7 +187,26 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         notes.append(
             f"{len(missing)} of {len(rows)} rows have no pose of the robot: {some_of(missing)}."
         )
+    notes += _beside_axis(session)
     return replace(session, warnings=(*notes, *session.warnings))
+
+
+def _beside_axis(session: Session) -> Iterator[str]:
+    """The note that measured targets stand beside the axis of a camera, or behind it."""
+    seen = (view.cam_from_target() for view in session.views)
+    places = np.array([pose.translation for pose in seen if pose is not None]).reshape(-1, 3)
+    middle = places.mean(axis=0) if len(places) else np.array([0.0, 0.0, 1.0])
+    axis = int(np.abs(middle).argmax())
+    sign = np.sign(middle[axis])
+    name = f"{'-' if sign < 0 else ''}{'xyz'[axis]}"
+    # No lens sees farther from its axis than half a right angle to another one.
+    is_along = sign * places[:, axis] > np.sqrt(0.5) * np.linalg.norm(places, axis=1)
+    if session.mount in MOUNTS and (axis, sign) != (2, 1.0) and is_along.all():
+        yield (
+            f"The targets stand along the camera's {name}, and before a lens they stand along its "
+            "z: their poses are in the frame of the camera's body (camera_link has x forward), or "
+            "of a tracker. The result is that frame's, too."
+        )
 
 
 def _corner_table(foreign: ForeignRecording) -> CornerTable | None:
