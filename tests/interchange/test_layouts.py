@@ -2181,6 +2181,23 @@ def test_targets_beside_the_axis_of_a_lens_are_noted(tmp_path, turn, words):
     assert words in done.err
 
 
+@pytest.mark.parametrize("names", ["image_{}.png", "image ({}).png"])
+def test_the_first_picture_of_a_series_may_have_no_number(tmp_path, names):
+    """As programs and systems name copies: image.png, image_1.png; image.png, image (2).png."""
+    first = 2 if "(" in names else 1
+    for at in range(9):
+        name = names.format(at - 1 + first) if at else "image.png"
+        shoot_one(tmp_path / "in" / name, at)
+    np.savetxt(tmp_path / "in/poses.txt", angles_of("xyz"))
+    write(tmp_path / "board.toml", tomli_w.dumps(target_document(world()[2].target)))
+    said = ("--target", tmp_path / "board.toml", "--mount", "eye-in-hand")
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    views = Session.load(tmp_path / "out").views
+    assert [Path(view.image).name for view in views][:2] == ["image.png", names.format(first)]
+    found = np.array([view.base_from_flange().as_matrix() for view in views])
+    np.testing.assert_allclose(found, world()[0], atol=1e-9)
+
+
 @pytest.mark.slow
 def test_images_are_searched_once_where_few_rows_decide_nothing(tmp_path, monkeypatch):
     session = world()[2]

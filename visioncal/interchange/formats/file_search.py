@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -143,6 +143,8 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
                 groups.append(group)
             else:
                 single += group.files
+    groups = [_with_first(group, single) for group in groups]
+    single = [file for file in single if not any(file in group.files for group in groups)]
     groups += _in_folders(source, single)
     grouped = {file for group in groups for file in group.files}
     # Of any names: images of a folder, and records that are called as images are.
@@ -167,6 +169,18 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
         path = folder / (label if len(files) > 1 else files[0].name)
         groups.append(FileGroup(path.as_posix(), tuple(sorted(files, key=natural))))
     return tuple(sorted(groups, key=lambda group: _in_order(Path(group.label))))
+
+
+def _with_first(group: FileGroup, single: Sequence[Path]) -> FileGroup:
+    """A series with the file of its name without a number, as the first of those from 1 or 2 on."""
+    stem = re.fullmatch(r"([^#]*[^#\W_])[\W_]*#\W?", Path(group.label).stem)
+    if stem is None or min(group.numbers, default=0) not in (1, 2):
+        return group
+    first = group.files[0].with_name(f"{stem[1]}{group.files[0].suffix}")
+    if first not in single:
+        return group
+    numbers = (min(group.numbers) - 1, *group.numbers)
+    return replace(group, files=(first, *group.files), numbers=numbers)
 
 
 def _in_folders(source: Path, single: Sequence[Path]) -> Iterator[FileGroup]:
