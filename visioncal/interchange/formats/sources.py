@@ -238,9 +238,7 @@ def _part(group: FileGroup, form: str | None) -> Part:
     lenses: dict[str, Mapping[str, Any]] = {}
     try:
         document = read_document(first) if is_document(first) else None
-        lenses = (
-            _printed_lens(group) if document is None else dict(lenses_in(document, group.label))
-        )
+        lenses = dict(lenses_in(document, group.label)) if document else _printed_lens(group)
         if not others:
             rows = joined(read_rows(first, form, document), first.stem, first.parent)
             return Part(group, tuple(rows), lenses=lenses)
