@@ -42,6 +42,8 @@ _CALL_S = 0.9
 _LEAST_HZ, _KICK_S = 1.0, 0.1
 # Timeout of the start of an asynchronous motion [s].
 _BEGIN_S = 0.5
+# Silence after which a controller, which sends every 8 ms, counts as lost [s].
+_SILENCE_S = 0.8
 # The client library's limits [rad/s, rad/s^2].
 _SPEED_LIMIT, _ACCELERATION_LIMIT = 3.14, 40.0
 
@@ -151,8 +153,7 @@ class StateStream:
         if stamp != self._newest:
             self._newest = stamp
             self._silence.restart()
-        # Silence after which a controller, which sends every 8 ms, counts as lost [s].
-        return bool(self.client.isConnected()) and self._silence.read() < 0.8
+        return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
 
     def check(self) -> None:
         """Checks that states arrive; raises DriverError."""
