@@ -266,15 +266,15 @@ def test_the_only_board_of_two_cameras_has_a_size(tmp_path):
 def one_picture_lost(folder: Path, camera: str, first: int) -> None:
     """The pictures of a camera from one of its rows on are those of the rows after them."""
     with (folder / "views.csv").open(encoding="utf-8") as file:
-        own = [row["view"] for row in csv.DictReader(file) if row["camera"] == camera]
-    of = dict(zip(own[first + 1 :], own[first:], strict=False))
+        camera_views = [row["view"] for row in csv.DictReader(file) if row["camera"] == camera]
+    of = dict(zip(camera_views[first + 1 :], camera_views[first:], strict=False))
 
     def change(rows: Rows) -> Rows:
-        kept = (row for row in rows if row["view"] != own[first])
+        kept = (row for row in rows if row["view"] != camera_views[first])
         return [row | {"view": of.get(row["view"], row["view"])} for row in kept]
 
     edit_rows(folder, change, "corners.csv")
-    edit_rows(folder, lambda rows: [row for row in rows if row["view"] != own[-1]])
+    edit_rows(folder, lambda rows: [row for row in rows if row["view"] != camera_views[-1]])
 
 
 @pytest.mark.parametrize("first", [8, slow(0)])

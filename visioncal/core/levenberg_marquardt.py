@@ -62,9 +62,9 @@ def levenberg_marquardt(
             if decrease <= tolerance:
                 return now.state, True
         else:
-            # The rest is rounding, curvature that Gauss-Newton neglects, or an error of the
-            # derivatives. The iteration ends at a step that raises the cost with a smaller
-            # predicted decrease (a hundredth of a sigma).
+            # A step that raises the cost, though it should decrease by a hundredth of a sigma at
+            # most, ends the iteration: the rest is rounding, curvature that Gauss-Newton neglects,
+            # or an error of the derivatives.
             if predicted <= 1e-4:
                 return now.state, True
             damping = max(10.0 * damping, START_DAMPING)

@@ -23,7 +23,7 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import covariance_of, fit_problem
+from visioncal.estimation.solve import covariance_of, fit_problem, repeated_share
 from visioncal.estimation.unknowns import BOARD, LENS, SIZE
 from visioncal.vision.board_shape import SCALE, stated_board_sigma
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
@@ -34,9 +34,8 @@ _SETTLED = 0.02
 # Largest share of a step that the next one is taken to repeat: it bounds extrapolation.
 _MOST_SHARE = 0.75
 # Most linearisations: a lens of another model leaves residuals beside which steps shrink by a
-# quarter each.
+# fifth each.
 _ROUNDS = 40
-_TINY = float(np.finfo(float).tiny)
 # A step is halved while it increases the corner residuals by this factor.
 FOLLOWS = 2.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
@@ -83,11 +82,10 @@ def fit_jointly(
             change = _change(fitted)
             if np.all(np.abs(change) <= _SETTLED * sigma):
                 break
-            # Large residuals let steps shrink slowly: what they sum to is taken (Aitken 1926).
-            steps = change / np.where(sigma > 0.0, sigma, np.inf)
-            share = float(np.clip(steps @ last / max(float(last @ last), _TINY), 0.0, _MOST_SHARE))
+            # Beside large residuals, steps shrink slowly: extrapolated.
+            step = change / np.where(sigma > 0.0, sigma, np.inf)
+            share, last = repeated_share(step, last, _MOST_SHARE)
             corners = _stepped(fitted, 1.0 / (1.0 - share))
-            last = np.zeros(len(steps)) if share > 0.0 else steps
             if corners is fitted.linearised:
                 raise np.linalg.LinAlgError("the corners follow no part of the step")
             previous = fitted

@@ -309,8 +309,8 @@ def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatAr
     curvature = found.curvature[inside[:, None], inside]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-8))
     values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
-    # Beside a direction that is steeper by far, one that is flat would be rounding. Least
-    # curvature, over that of each size alone.
+    # Beside a direction that is steeper by far, one that is flat would be rounding: the curvature
+    # is at least so much of that of each size alone.
     flat = max(0.1, ROUNDING * float(values.max(initial=0.0)))
     curvature = (vectors * (np.maximum(values, flat) + damping)) @ vectors.T
     slope = scale * slope

@@ -84,16 +84,24 @@ def fit_problem(
         noise = estimate_noise(problem, state, noise)
         if _are_close(previous, noise):
             break
-        # Levels of sensors and robots follow each other slowly: extrapolated (Aitken 1926).
+        # Levels of sensors and robots follow each other slowly: extrapolated.
         change = np.log(noise.sensors / previous.sensors)
-        share = float(
-            np.clip(change @ last / max(float(last @ last), np.finfo(float).tiny), 0.0, _MOST_SHARE)
-        )
+        share, last = repeated_share(change, last, _MOST_SHARE)
         noise = replace(noise, sensors=noise.sensors * np.exp(change * share / (1.0 - share)))
-        last = np.zeros_like(change) if share > 0.0 else change
     # A solve keeps the weights of its start: solve once more from the solution.
     state, settled = solve_problem(problem, state, noise, is_near=True)
     return Solution(state, noise, settled)
+
+
+def repeated_share(step: FloatArray, last: FloatArray, most: float) -> tuple[float, FloatArray]:
+    """The share s of a (k,) step that the next one repeats: all sum to 1 / (1 - s) steps.
+
+    By the step before (Aitken 1926), and at most a share. The second is the one for the next step;
+    zero after one that is extrapolated.
+    """
+    square = max(float(last @ last), np.finfo(float).tiny)
+    share = float(np.clip(step @ last / square, 0.0, most))
+    return share, np.zeros_like(step) if share > 0.0 else step
 
 
 def _are_close(before: Noise, after: Noise) -> bool:

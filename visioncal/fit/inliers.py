@@ -102,8 +102,8 @@ class Search:
         found = most_likely(mixed, begin, low, high)
         random = {size for size, *_ in unknowns.priors() if size >= 0}
         if is_again:
-            # Of a size that stays as it was, the last linearisation told. Change of a size's
-            # logarithm from which it is asked again whether chance explains it.
+            # A size was tested at the last linearisation, and is again where its logarithm has
+            # changed by more than this.
             moved = np.abs(found.estimate.logs - begin) > 0.2
             is_open = (high > low) & (found.estimate.logs > low)
             random -= set(np.flatnonzero(is_open & ~moved).tolist())

@@ -92,9 +92,8 @@ def far_off(parameters: Sequence[ArmParameter], robot: Robot) -> Iterator[str]:
     for name, words, why in _FAR_OFF:
         off = dict[str, float]()
         for at in parameters:
-            # A cosine's name contains that of a sine. Zeros and eccentricities that are off by more
-            # than makers leave [rad], in so many sigmas: what the names of their parameters
-            # contain, and words.
+            # A cosine's name contains that of a sine. Makers leave zeros and eccentricities within
+            # 2 mrad; one is off by more where ten sigmas show it.
             if name in at.name and at.sigma and abs(at.change) > max(2e-3, 10.0 * at.sigma):
                 off[at.joint] = float(np.hypot(off.get(at.joint, 0.0), at.change))
         places = map(robot.joint_names.index, off)

@@ -179,7 +179,7 @@ def _point_errors(
     by_view = np.concatenate(each_view, axis=2)[:, :, : None if is_moving else 0]
     columns, smooth = _columns(stack, camera, at, basis, count)
     # Wrong corners hide each other, since poses and lens follow them: each counts by what it
-    # scatters beside the others. Most rounds of the weights of corners.
+    # scatters beside the others, in at most so many rounds.
     for _ in range(12):
         stack = replace(stack, weights=weights[stack.ids], zooms=by_view)
         by_places, pulls, unknowns = _reduced(stack, columns, smooth)

@@ -169,7 +169,7 @@ class CellFit:
             shape = sizes.shapes.get(self.cell.session.board_frames[name])
             if shape is not None:
                 values[stated.parts[BOARD, name]] = shape
-        free = stated.free[~np.isin(stated.free, stated.held)]
+        free = np.setdiff1d(stated.free, stated.held)
         return stated.with_values(free, values[free])
 
     @property

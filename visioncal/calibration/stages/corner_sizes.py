@@ -124,8 +124,8 @@ def _scaled_by(
     # Difference of squared errors over the noise from which on a size is clearly another one: 6
     # sigma.
     fits &= 2.0 * counts * excess > 36.0 * sigma_px**2
-    # Clear views determine the share, by which less clear ones are of it, too. Ratio of misfits
-    # from which on a single view is clearly of another size.
+    # Clear views determine the share, by which less clear ones are of it, too. A single view is
+    # clear from a larger ratio of misfits on.
     clear = fits & (given > (CLEAR_RATIO if fits.sum() > 1 else 5.0) * scaled)
     numbers = np.array([*corners])
     chosen = {view: corners[view] for view in numbers[clear].tolist()}
