@@ -23,6 +23,7 @@ from support.slopes import jacobian
 from visioncal import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import Corners
 from visioncal.frames.camera_chain import Plane
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
@@ -208,6 +209,23 @@ def test_a_place_states_the_sources_of_its_uncertainty():
     assert found.radius95_mm == pytest.approx(0.2 * np.sqrt(5.991), rel=1e-3)
     # With the noise from few residuals, the region is wider.
     assert Located(np.zeros(3), parts, 8.0).radius95_mm > 1.15 * found.radius95_mm
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("is_stated", [True, False], ids=["stated lens", "estimated lens"])
+def test_the_budget_is_that_of_places_where_the_views_looked(mount, is_stated):
+    options = CellOptions(mount=mount, views=10, state_intrinsics=is_stated, cut_views=0.0, seed=2)
+    cell = simulate(options)
+    calibration, corners = calibration_of(cell), corner_positions(BOARD)
+    squares = []
+    for at, pose in enumerate(cell.cam_from_target):
+        px = project(options.camera, corners @ pose[:3, :3].T + pose[:3, 3])
+        flange = None if mount == "eye-to-hand" else cell.robot.base_from_flange[at]
+        seen, middle = Corners(0, np.arange(len(px)), px, 0.7), corners.mean(axis=0)
+        place = locate_target(calibration, seen, BOARD, flange, middle, sigma_px=0.01)
+        squares.append(place.budget_mm["calibration"] ** 2)
+    # Noise moves the views of the fit by a ten thousandth of their distance.
+    assert calibration.uncertainty.total_mm == pytest.approx(np.sqrt(np.mean(squares)), rel=2e-3)
 
 
 def test_a_place_that_cannot_be_located_is_refused_by_name(in_hand):

@@ -28,28 +28,27 @@ class Sources:
 
 @dataclass(frozen=True, eq=False)
 class _Gain:
-    """Jacobian of some unknowns' estimates by all errors: V^-1 X C."""
+    """Jacobian of the unknowns' estimates by all errors: V^-1 X C."""
 
-    rows: FloatArray  # (n, 6, c) by the observations.
-    units: FloatArray  # (u, 6 w, c) by the errors that the observations of a unit share.
-    columns: FloatArray  # (p, c) covariance of all unknowns with these.
+    rows: FloatArray  # (n, 6, p) by the observations.
+    units: FloatArray  # (u, 6 w, p) by the errors that the observations of a unit share.
+    columns: FloatArray  # (p, p) covariance of the unknowns.
 
     @classmethod
-    def of(cls, problem: Problem, state: State, noise: Noise, count: int | None = None) -> "_Gain":
-        """The gain of the first `count` unknowns, or of all."""
-        fisher = fisher_information(problem, state, noise)
-        columns = covariance_among(fisher, problem.counted)[:, :count]
+    def of(cls, problem: Problem, state: State, noise: Noise) -> "_Gain":
+        """The gain of a problem at a state."""
+        columns = covariance_among(fisher_information(problem, state, noise), problem.counted)
         linear = problem.linear(state, ideal=True)
         white = Whitening.of(problem, noise, linear.by_errors)
         rows, unit_of = white.inverse(linear.jacobian @ columns), problem.units[0]
-        errors = np.zeros((white.count, linear.by_errors.shape[2], columns.shape[1]))
+        errors = np.zeros((white.count, linear.by_errors.shape[2], len(columns)))
         in_unit = unit_of >= 0
         by_errors = np.swapaxes(linear.by_errors[in_unit], 1, 2)
         np.add.at(errors, unit_of[in_unit], by_errors @ rows[in_unit])
         return cls(rows, errors, columns)
 
     def of_flange(self, problem: Problem, robot: int, variances: FloatArray) -> FloatArray:
-        """(c, c) contribution of a robot's flange errors of (2,) variances [rad^2, m^2]."""
+        """(p, p) contribution of a robot's flange errors of (2,) variances [rad^2, m^2]."""
         units, slots = np.nonzero(problem.units[1] == robot)
         gain = self.units[units[:, None], 6 * slots[:, None] + np.arange(6)]
         return gram(gain, np.repeat(variances, 3)[:, None] * gain)
@@ -58,7 +57,7 @@ class _Gain:
 def covariance_by_source(
     problem: Problem, state: State, noise: Noise, sources: Sources
 ) -> dict[str, FloatArray]:
-    """Splits the covariance of the edges into contributions (6 e, 6 e) of the sources.
+    """Splits the covariance of the unknowns into contributions (p, p) of the sources.
 
     The estimate is linear in the errors of observations, flanges, effects and priors: each
     contributes its own covariance through the same gain, C X' V^-1 V_k V^-1 X C, and the parts add
@@ -66,9 +65,8 @@ def covariance_by_source(
     the same corners: each takes half of the cross terms, which may make one contribution negative
     where they compensate each other.
     """
-    edges = 6 * len(problem.unknown)
-    gain, sensor_covariance = _Gain.of(problem, state, noise, edges), problem.covariance(noise)
-    parts: dict[str, FloatArray] = defaultdict(lambda: np.zeros((edges, edges)))
+    gain, sensor_covariance = _Gain.of(problem, state, noise), problem.covariance(noise)
+    parts: dict[str, FloatArray] = defaultdict(lambda: np.zeros_like(gain.columns))
     observers = np.array(problem.observations.observers)
     for frame in dict.fromkeys(problem.observations.observers):
         rows = observers == frame

@@ -10,6 +10,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.directions import SIGMA_LIMIT_M
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
+from visioncal.core.prediction import through
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.frames.camera_chain import (
@@ -135,8 +136,8 @@ def locate_by_depth(
         by_cam = cam_pose.base_from_cam[:3, :3]
         by_noise = (noise_m * by_cam @ unit)[:, None]
         parts = {
-            "pixels": _mapped(noise_px * by_cam @ by_px, np.eye(2)),
-            "depth": _mapped(by_noise, np.eye(1)),
+            "pixels": through(noise_px * by_cam @ by_px, np.eye(2)),
+            "depth": through(by_noise, np.eye(1)),
             **_camera_parts(
                 *(eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ by_lens),
                 (np.outer(by_cam @ unit, by_depth), model.covariance, cross),
@@ -288,9 +289,9 @@ def _on_plane(
     by_camera = projection @ cam_pose.camera_jacobian(point_cam)
     by_plane = np.outer(along / rise, np.append(-p_base, 1.0))
     parts = {
-        "pixels": _mapped(noise_px * by_cam @ by_px, np.eye(2)),
+        "pixels": through(noise_px * by_cam @ by_px, np.eye(2)),
         "focus": np.outer(by_focus, by_focus),
-        "plane": _mapped(by_plane, plane.covariance),
+        "plane": through(by_plane, plane.covariance),
         **_camera_parts(eye, cam_pose, by_camera, by_cam @ by_lens),
     }
     return _located(eye, p_base, parts, _distance_warning(eye, point_cam))
@@ -327,14 +328,10 @@ def _camera_parts(
         cross = np.pad(cross, ((0, 0), (0, len(covariance) - cross.shape[1])))
         covariance = np.block([[covariance, cross.T], [cross, depth_covariance]])
     return {
-        "calibration": _mapped(by_calibration, covariance),
-        "robot": _mapped(flange_jacobian, cam_pose.flange_noise),
-        "arm": _mapped(by_arm[:, independent], np.eye(eye.posture_error_count)),
+        "calibration": through(by_calibration, covariance),
+        "robot": through(flange_jacobian, cam_pose.flange_noise),
+        "arm": through(by_arm[:, independent], np.eye(eye.posture_error_count)),
     }
-
-
-def _mapped(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
 def _located(
@@ -438,8 +435,8 @@ def locate_target(
     pose, point_cam = view.cam_from_target[0], candidates_cam[0]
     by_cam = cam_pose.base_from_cam[:3, :3] @ point_jacobian(pose, point)
     parts = {
-        "pixels": _mapped(by_cam, view.covariance[0]),
-        "target": _mapped((by_cam @ view.by_scale[0])[:, None], np.array([[view.scale_sigma**2]])),
+        "pixels": through(by_cam, view.covariance[0]),
+        "target": through((by_cam @ view.by_scale[0])[:, None], np.array([[view.scale_sigma**2]])),
         **_camera_parts(
             eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ view.by_lens[0]
         ),

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.prediction import sigmas_of, total_of
 from visioncal.core.quantiles import f_limit
 from visioncal.core.types import FloatArray
 
@@ -26,7 +27,7 @@ class Located:
     @cached_property
     def covariance(self) -> FloatArray:
         """(3, 3) sum of the independent parts [m^2]."""
-        return np.asarray(np.sum(list(self.parts.values()), axis=0))
+        return total_of(self.parts)
 
     @property
     def sigma_mm(self) -> FloatArray:
@@ -36,9 +37,7 @@ class Located:
     @property
     def budget_mm(self) -> dict[str, float]:
         """Standard deviation by source, and their `total` [mm]."""
-        every = {**self.parts, "total": self.covariance}
-        squares = {name: max(np.trace(covariance), 0.0) for name, covariance in every.items()}
-        return {name: float(1e3 * np.sqrt(square)) for name, square in squares.items()}
+        return sigmas_of(self.parts)
 
     @property
     def largest(self) -> str:

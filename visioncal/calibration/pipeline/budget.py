@@ -8,9 +8,10 @@ from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.stages.validate import HeldOutResiduals, needed_frames, pose_residuals
 from visioncal.core.directions import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.core.prediction import sigmas_of, through, to_points, total_of
 from visioncal.core.quantiles import radius95
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import apply_each, point_covariance
+from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.fit import Fit
@@ -67,31 +68,23 @@ def left_out(cell_fit: CellFit) -> HeldOutResiduals:
     return HeldOutResiduals(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
 
 
-def _covariances_of_edges(cell_fit: CellFit, fit: Fit) -> dict[str, FloatArray]:
-    """Covariances (6 e, 6 e) of the unknown frames, by source and as a `total`."""
+def _by_source(cell_fit: CellFit, fit: Fit) -> dict[str, FloatArray]:
+    """Covariances (p, p) of the unknowns by source; their sum is that of all."""
     parts = covariance_by_source(fit.problem, fit.state, fit.noise, _sources(cell_fit, fit))
-    at = fit.unknowns.of_kinds(EDGE)
-    parts |= {name: array[np.ix_(at, at)] for name, array in fit.by_source.items()}
-    return parts | {"total": sum(parts.values(), np.zeros((len(at), len(at))))}
-
-
-def _sigma_mm(covariance: FloatArray) -> float:
-    # Of two sources that compensate each other, one may have a negative trace.
-    return 1e3 * float(max(np.trace(covariance), 0.0) ** 0.5)
+    return {**parts, **fit.by_source}
 
 
 def budget_mm(cell_fit: CellFit, fit: Fit) -> dict[str, dict[str, float]]:
     """Standard deviations of unknown frames' positions in their parents, by source, in all [mm]."""
-    parts = _covariances_of_edges(cell_fit, fit)
+    parts = _by_source(cell_fit, fit)
     firsts = {frame: fit.unknowns[EDGE, frame].start + 3 for frame in fit.frames}
-    return {
-        key: {name: _sigma_mm(array[at : at + 3, at : at + 3]) for name, array in parts.items()}
-        for key, at in firsts.items()
-    }
+    return {frame: sigmas_of(parts, axes=slice(at, at + 3)) for frame, at in firsts.items()}
 
 
 def uncertainty_of(cell_fit: CellFit, fit: Fit) -> UncertaintyResult:
-    """Uncertainty of a target's middle that one camera and one robot locate, by all views' mean.
+    """Uncertainty of a target's middle that one camera locates: mean square of its views.
+
+    Its size, and the pose of what carries the camera, are exact; the lens errs with the transform.
 
     Returns:
         The section of the result, without intervals of the noise.
@@ -101,9 +94,14 @@ def uncertainty_of(cell_fit: CellFit, fit: Fit) -> UncertaintyResult:
     points = np.array([middles.get(name, np.zeros(3)) for name in seen])
     points_cam = apply_each(fit.problem.measured(fit.state), points)
     distances_m, point_cam = np.linalg.norm(points_cam, axis=1), points_cam.mean(axis=0)
-    covariances = {
-        name: point_covariance(fit.frames[camera], edge[:6, :6], point_cam)
-        for name, edge in _covariances_of_edges(cell_fit, fit).items()
+    # Each view's middle, in the frame that carries the camera.
+    rows = np.flatnonzero(np.array(fit.seen.observers) == camera)
+    jacobian = fit.closure(rows, fit.tree.branches[camera].parent).linear.jacobian
+    places = apply_each(np.broadcast_to(fit.frames[camera], (len(rows), 4, 4)), points_cam[rows])
+    by_unknowns = (to_points(places) @ jacobian)[:, 3:]
+    parts = {
+        name: through(by_unknowns, array).mean(axis=0)
+        for name, array in _by_source(cell_fit, fit).items()
     }
     limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
     joint = fit.covariance((EDGE, camera), (EDGE, target))
@@ -111,8 +109,8 @@ def uncertainty_of(cell_fit: CellFit, fit: Fit) -> UncertaintyResult:
     return UncertaintyResult(
         point_cam_m=point_cam,
         distances_m=np.array([distances_m.min(), distances_m.max()]),
-        budget_mm={name: _sigma_mm(at) for name, at in covariances.items()},
-        radius95_mm=1e3 * radius95(covariances["total"]),
+        budget_mm=sigmas_of(parts),
+        radius95_mm=1e3 * radius95(total_of(parts)),
         noise_95={},
         spectrum=np.sqrt(np.maximum(values, 0.0)),
     )

@@ -39,9 +39,10 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
+from visioncal.core.prediction import at_points, sigmas_of, through, total_of
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.tolerance_probability import chance_within, radius_within
-from visioncal.core.transforms import adjoint, apply_each, compose, invert, log
+from visioncal.core.transforms import adjoint, apply_each, invert, log
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.fit import Closure, Fit
 from visioncal.estimation.unknowns import BOARD, SIZE
@@ -75,7 +76,7 @@ class Picks:
     @property
     def covariances(self) -> FloatArray:
         """(k, 6, 6) total covariance."""
-        return np.asarray(np.sum(list(self.parts.values()), axis=0))
+        return total_of(self.parts)
 
     @cached_property
     def _with_strays(self) -> tuple[FloatArray, FloatArray | None]:
@@ -131,15 +132,10 @@ class Picks:
         return self._budget(slice(3), float(np.rad2deg(1.0)))
 
     def _budget(self, axes: slice, unit: float) -> dict[str, float]:
-        budget, known, total = {}, {}, self.covariances
+        known = {}
         if self.offsets is not None:
             known = {CONTROLLER: self.offsets[:, :, None] * self.offsets[:, None]}
-            total = total + known[CONTROLLER]
-        for name, covariances in {**self.parts, **known, "total": total}.items():
-            squares = np.trace(covariances[:, axes, axes], axis1=1, axis2=2)
-            # Of two sources that compensate, one may be negative.
-            budget[name] = unit * float(max(squares.mean(), 0.0) ** 0.5)
-        return budget
+        return sigmas_of({**self.parts, **known}, unit, axes)
 
     def stays_within(self, need: Need | None) -> str:
         """The limits that 95 % of picks are within, in the units of a need."""
@@ -256,7 +252,7 @@ def _picks(
         covariance = covariance - bias @ bias.T
         by_posture, in_time = _arm_covariances(fit.closure(rows), robot, stops, as_noise, bias)
         if not whole:
-            by_posture, in_time = (to_base @ array @ to_base.mT for array in (by_posture, in_time))
+            by_posture, in_time = (through(to_base, array) for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
         if as_noise.white is not None:
             level = np.hypot(as_noise.white, as_noise.of_session)
@@ -272,9 +268,9 @@ def _picks(
     parts["board"] = closure.covariance(of_boards)
     carried = carries[:, None, None]
     # Combined noise counts as the robot's, where it carries the camera.
-    combined = carried * (to_base @ _diagonal(level) @ to_base.mT)
+    combined = carried * through(to_base, _diagonal(level))
     parts["look"] = combined if fit.is_combined else closure.noise(noise)
-    by_source = {name: _at_points(part, at_m) for name, part in parts.items()}
+    by_source = {name: at_points(part, at_m) for name, part in parts.items()}
     at_camera = fit.measured[rows]
     in_camera = apply_each(at_camera, middles)
     axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
@@ -291,7 +287,7 @@ def _picks(
     pick_noise = np.where(carried, _diagonal(pick_level), fixed)
     by_source["pick"] = _flange_covariance(fit, robot, stops, in_base, pick_noise)
     if as_noise is not None and not as_noise.of_links:
-        by_source["pick"] = by_source["pick"] + carried * _at_points(by_posture, at_m)
+        by_source["pick"] = by_source["pick"] + carried * at_points(by_posture, at_m)
     by_source["left out"] = np.broadcast_to(_excess_covariance(fitted, rows), parts["look"].shape)
     picks = Picks(
         camera,
@@ -371,12 +367,6 @@ def _flange_covariance(
         position_m2 = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
         covariance[:, 3:, 3:] = position_m2[:, None, None] * np.eye(3)
     return covariance
-
-
-def _at_points(covariances: FloatArray, points_m: FloatArray) -> FloatArray:
-    """(n, 6, 6) covariance of rotation and (n, 3) points, from that of their frame's twist."""
-    carry = adjoint(compose(np.eye(3), -points_m))
-    return np.asarray(carry @ covariances @ carry.mT)
 
 
 def _arm_covariances(
