@@ -10,7 +10,7 @@ from support.commands import visioncal as command
 
 from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import compose
-from visioncal.estimation.problem import ANYTHING
+from visioncal.estimation.problem_parts import ANYTHING
 from visioncal.planning.cell import TYPICAL_NOISE, InstrumentCell, Limits
 from visioncal.planning.instrument import STABLE, plan_for_instrument, readings
 from visioncal.planning.purposes import purpose_of
@@ -49,10 +49,10 @@ def test_planned_stops_are_well_conditioned_and_better_than_random_ones(criterio
 def test_information_rows_are_those_of_the_fit():
     shop = tracked(InstrumentOptions(robot=ARM, stops=25, seed=3))
     found = calibrate(session_of(shop), level="hand-eye")
-    problem, linear = readings(cell_of(), purpose_of("hand-eye"), shop.joints)
-    assert linear.jacobian.shape == (25, 6, 12)
+    read = readings(cell_of(), purpose_of("hand-eye"), shop.joints)
+    assert read.slopes.shape == (25, 6, 12)
     # An unread rotation counts as unknown, as in the fit.
-    assert (problem.observations.covariance[:, 0, 0] == ANYTHING).all()
+    assert (read.seen.covariance[:, 0, 0] == ANYTHING).all()
     x, z = (found.edges[name].matrix for name in ("base_from_instrument", "flange_from_probe"))
     cell = cell_of()
     noise = found.noise
@@ -66,10 +66,9 @@ def test_information_rows_are_those_of_the_fit():
             np.deg2rad(noise["robot_rotation_deg"]), 1e-3 * noise["robot_translation_mm"]
         ),
     )
-    problem, linear = readings(cell, purpose_of("hand-eye"), shop.joints)
-    weights = np.linalg.inv(problem.total_covariance(linear, cell.noise))
-    rows = linear.jacobian[:, :, [0, 1, 2, 3, 4, 5, 9, 10, 11]]
-    information = np.einsum("mij,mik,mkl->jl", rows, weights, rows)
+    read = readings(cell, purpose_of("hand-eye"), shop.joints)
+    rows = read.whitened[:, :, [0, 1, 2, 3, 4, 5, 9, 10, 11]]
+    information = np.einsum("mij,mil->jl", rows, rows)
     predicted = np.sqrt(np.diag(np.linalg.inv(information)))
     stated = np.sqrt(np.diag(found.joint_covariance))[[0, 1, 2, 3, 4, 5, 9, 10, 11]]
     # The fit's own noise was estimated beside what an arm may do wrong, which adds a little.

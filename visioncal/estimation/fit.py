@@ -8,6 +8,7 @@ tests of residuals alone. Another engine stands behind the same door if it gives
     unknowns, values, frames, camera      what there is, and its estimates
     robots, noise, sigmas_px, shown_px    noise of flanges, sensors and corners
     seen, measured, expected, closure     sightings, and their forward model
+    fisher, whitened                      information, and that of each sighting
     by_noise, beside, shift               covariances by source; what held values would have moved
     absorbed, equations, with_columns     score tests of further unknowns
     bias, beside_lasting                  the response to what it takes for noise, or estimates last
@@ -15,18 +16,21 @@ tests of residuals alone. Another engine stands behind the same door if it gives
 Everything else here follows from these.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from visioncal.core.linalg import covariance_among
-from visioncal.core.transforms import adjoint
-from visioncal.core.types import Camera, FloatArray, IntArray
+from visioncal.core.prediction import to_points
+from visioncal.core.transforms import adjoint, apply_each, invert, robot_part
+from visioncal.core.types import Camera, FloatArray, IntArray, Mount
+from visioncal.estimation.appearance import Appearance, LensBoardParameters
 from visioncal.estimation.arm import arm_effect
+from visioncal.estimation.chain import chain
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.normal_equations import normal_equations
+from visioncal.estimation.normal_equations import fisher_information, normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Linear, Noise, Observations, State
 from visioncal.estimation.solve import Solution, covariance_of
@@ -75,6 +79,32 @@ class Fit:
     # (p, p) covariances from sources other than noise and priors, by source.
     by_source: Mapping[str, FloatArray] = field(default_factory=dict)
 
+    @classmethod
+    def of_stops(
+        cls,
+        mount: Mount,
+        edges: tuple[FloatArray, FloatArray],
+        base_from_flange: FloatArray,
+        noise: Noise,
+        covariance: FloatArray | None = None,
+        effects: Sequence[Effect] = (),
+    ) -> "Fit":
+        """Stops that are yet to be taken by one robot and one camera, with what they would show.
+
+        Args:
+            mount: Mounting of the camera.
+            edges: The (4, 4) edges of the camera and of what it sees.
+            base_from_flange: (s, 4, 4) the stops.
+            noise: Noise of the flange.
+            covariance: (s, 6, 6) of the poses that are measured there; None where unknown.
+            effects: Effects common to many views.
+        """
+        x, z = edges
+        measured = invert(robot_part(base_from_flange, mount) @ x) @ z
+        problem = chain(mount, base_from_flange, measured, covariance, effects=effects)
+        state = State(np.stack([x, z]), problem.start_values)
+        return cls(problem, Solution(state, noise))
+
     @property
     def state(self) -> State:
         """Estimated unknowns, as the engine orders them."""
@@ -117,6 +147,21 @@ class Fit:
             if name != LENSES:
                 parts[Unknown.of_effect(name)] = columns
         return Unknowns(parts, uncertain, problem.moving)
+
+    @property
+    def lens_and_boards(self) -> LensBoardParameters:
+        """Lens and boards of the only camera, and their covariance."""
+        cameras, prior = self.linearised.camera_parameters, self.linearised.known
+        ((name, problem),) = cameras.problems.items()
+        return LensBoardParameters(
+            Appearance(cameras.camera(name), cameras.values[cameras.boards]),
+            problem.basis,
+            problem.positions,
+            self.linearised.free,
+            self.linearised.held,
+            prior.information,
+            prior.gradient,
+        )
 
     @property
     def lens_columns(self) -> slice:
@@ -216,6 +261,17 @@ class Fit:
         closed = replace(part, effects=tuple(effects))
         return Closure(closed, closed.linear(self.state, ideal=True), poses)
 
+    def located(self, camera: str, points_m: FloatArray) -> FloatArray:
+        """Jacobian of things that a camera sees where its m sightings saw points (m, 3) [m].
+
+        Returns:
+            (m, 6, p) of rotation [rad] and place [m], in the frame that carries the camera.
+        """
+        rows = np.flatnonzero(np.array(self.seen.observers) == camera)
+        jacobian = self.closure(rows, self.tree.branches[camera].parent).linear.jacobian
+        places = apply_each(self.frames[camera] @ self.measured[rows], points_m)
+        return np.asarray(to_points(places) @ jacobian)
+
     @property
     def frames(self) -> dict[str, FloatArray]:
         """Poses (4, 4) `parent_from_frame` of the unknown frames."""
@@ -244,6 +300,23 @@ class Fit:
         return normal_equations(self.problem, self.state, self.noise)
 
     @cached_property
+    def fisher(self) -> FloatArray:
+        """(p, p) expected information on the unknowns, with priors."""
+        return fisher_information(self.problem, self.state, self.noise)
+
+    @property
+    def slopes(self) -> FloatArray:
+        """(n, 6, p) Jacobian of the sightings' residuals by the unknowns."""
+        return self.problem.linear(self.state, ideal=True).jacobian
+
+    @property
+    def whitened(self) -> FloatArray:
+        """(n, 6, p) the same in units of their noise, F; F^T F is the sightings' information."""
+        linear = self.problem.linear(self.state, ideal=True)
+        root = np.linalg.cholesky(self.problem.total_covariance(linear, self.noise))
+        return np.asarray(np.linalg.solve(root, linear.jacobian))
+
+    @cached_property
     def absorbed(self) -> FloatArray:
         """(p, p) covariance that the fit absorbed of the residuals'; zero for held unknowns."""
         return covariance_among(self.equations[0], self.problem.moving)
@@ -254,6 +327,10 @@ class Fit:
         state = State(self.state.edges, np.concatenate(values))
         problem = self.problem.with_effects([*self.problem.effects, *effects])
         return replace(self.at(state), problem=problem, by_source={})
+
+    def with_arm(self, robot: str, errors: ArmErrors, name: str = "arm") -> "Fit":
+        """The fit with errors of an arm among the unknowns."""
+        return self.with_columns(arm_effect(errors, robot, name))
 
     @cached_property
     def by_noise(self) -> FloatArray:
@@ -284,7 +361,7 @@ class Fit:
         in_time, index = errors.basis[:, :, errors.is_time_correlated], self.robots.index(robot)
         noise = self.noise if errors.white is None else self.noise.with_robot(index, errors.white)
         time_errors = replace(errors, basis=in_time, time_correlated_count=in_time.shape[2])
-        wide = self.with_columns(arm_effect(time_errors, robot, "lasting errors"))
+        wide = self.with_arm(robot, time_errors, "lasting errors")
         return replace(wide, solution=replace(wide.solution, noise=noise))
 
     def step_to(self, wide: "Fit") -> FloatArray:
@@ -300,7 +377,7 @@ class Fit:
         """
         size, last = self.problem.size, errors.is_time_correlated
         fit = self.beside_lasting(robot, errors) if last.any() else self
-        information = fit.with_columns(arm_effect(errors, robot)).equations[0]
+        information = fit.with_arm(robot, errors).equations[0]
         first = fit.problem.size
         fitted = covariance_among(information[:first, :first], fit.problem.moving)
         return np.asarray((fitted @ information[:first, first:])[:size] * ~last)

@@ -7,8 +7,8 @@ import numpy as np
 
 from visioncal.core.linalg import NULL_SHARE, gram
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.problem import ANYTHING, Problem
-from visioncal.estimation.problem_parts import Linear, Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import ANYTHING, Linear, Noise, State
 
 
 @dataclass(frozen=True, eq=False)

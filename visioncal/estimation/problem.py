@@ -21,6 +21,7 @@ from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, inve
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import (
+    ANYTHING,
     Effect,
     FramePrior,
     JacobianBlock,
@@ -36,9 +37,6 @@ from visioncal.estimation.problem_parts import (
     units_of,
 )
 from visioncal.session.tree import PathStep, Tree
-
-# Uninformative variance of a flange error that was not observed [rad^2 and m^2].
-ANYTHING = 1e4
 
 
 @dataclass(frozen=True, eq=False)

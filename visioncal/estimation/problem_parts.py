@@ -15,6 +15,8 @@ from visioncal.session.tree import PathStep
 
 # Name of the only robot of a cell.
 ROBOT = "robot"
+# Uninformative variance of an error that was not observed [rad^2 and m^2].
+ANYTHING = 1e4
 # Where an observation's covariance is a guess, its errors are up to this many times larger: with
 # tilt and distance.
 UNEVEN = 3.0

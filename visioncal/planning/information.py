@@ -12,19 +12,14 @@ from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
 from visioncal.core.linalg import covariance_from, gram
+from visioncal.core.prediction import to_points
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import adjoint, compose, invert, skew
+from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
-from visioncal.estimation.arm import arm_effect
 from visioncal.estimation.armpair import ArmPair
-from visioncal.estimation.chain import chain
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.normal_equations import fisher_information
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, State
-from visioncal.planning.cell import AnyCell, PlanCell, seen_from
+from visioncal.planning.cell import AnyCell, PlanCell
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.robot.arm_model import COMPLIANCE, ArmModel, block_size
@@ -69,7 +64,7 @@ class RecordedStops:
     @property
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
-        return _effect_information(self.fit.problem)
+        return prior_of_effects(self.fit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,35 +155,30 @@ def stop_factors(
     uncertainty of the board's size. There are six rows, and those of a lens that is estimated.
     """
     free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
-    lens = free.columns < len(intrinsics(free.appearance.camera))
-    lens &= ~free.anchored & estimates_lens
+    lens = is_of_lens(free) & ~free.anchored & estimates_lens
     poses = cell.cam_from_target(q)
     stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
-    information = free.information if recorded is None else recorded.shared
-    # The other shared parameters do not affect a stop at which the arm stands still.
-    others = np.zeros((int(seen.sum()), 6, len(information) - len(free.columns)))
-    columns = 12 + len(information) + arm_size(cell.robot, purpose, recorded)
+    count = len(free.columns)
+    shared = count if recorded is None else len(recorded.shared)
+    columns = 12 + shared + arm_size(cell.robot, purpose, recorded)
     factors = np.zeros((len(q), 6 + int(lens.sum()), columns))
     if seen.any():
         compressed = compress(stack, free.basis, free.appearance, poses[seen])
-        flange = cell.robot.base_from_flange(q[seen])
-        jacobian = np.concatenate([compressed.by_shared[:, :, free.columns], others], axis=2)
-        prior = PriorInformation(information, np.zeros(len(information)))
-        problem = chain(
+        fit = Fit.of_stops(
             cell.mount,
-            flange,
-            poses[seen],
+            (cell.x, cell.z),
+            cell.robot.base_from_flange(q[seen]),
+            cell.noise,
             floored_sigma_px(cell.pixel_px) ** 2 * covariance_from(compressed.information),
-            effects=[Effect.free("lens and boards", prior, jacobian)],
+            [free.effect(compressed.by_shared[:, :, free.columns])],
         )
         arm = None if recorded is None else recorded.arm
         if arm is not None:
             arm = replace(arm, basis=link_basis(cell.robot, q[seen]))
-        problem = with_arm_errors(cell, purpose, problem, q[seen], arm)
-        state = State(np.stack([cell.x, cell.z]), problem.start_values)
-        linear = problem.linear(state, ideal=True)
-        root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
-        factors[seen, :6] = np.linalg.solve(root, linear.jacobian)
+        fit = with_arm_errors(cell, purpose, fit, q[seen], arm)
+        # The other shared parameters do not affect a stop at which the arm stands still.
+        affecting = np.delete(np.arange(columns), slice(12 + count, 12 + shared))
+        factors[np.ix_(seen, np.arange(6), affecting)] = fit.whitened
         if lens.any():
             found = _lens_rows(stack, free, poses[seen], free.columns[lens], cell.pixel_px)
             at = 12 + np.flatnonzero(lens)
@@ -228,6 +218,11 @@ def parameters_of(
 ) -> LensBoardParameters:
     """Free parameters of lens and boards: those of recorded stops, or of the stated cell."""
     return stated(cell, estimates_lens=estimates_lens) if recorded is None else recorded.free
+
+
+def is_of_lens(free: LensBoardParameters) -> Mask:
+    """(k,) mask of those free parameters of lens and boards that are the lens's."""
+    return np.asarray(free.columns < len(intrinsics(free.appearance.camera)))
 
 
 def stated(cell: PlanCell, *, estimates_lens: bool = False) -> LensBoardParameters:
@@ -270,19 +265,20 @@ def pick_jacobian(
         the flange, or the base. The size of things is not that of the board.
     """
     poses, middle = cell.cam_from_target(q), corner_positions(cell.target).mean(axis=0)
-    points, jacobian = (poses @ [*middle, 1.0])[:, :3], np.zeros((len(q), 6, size))
-    jacobian[:, :, :6] = adjoint(compose(np.eye(3), -points))
-    free = parameters_of(cell, recorded, estimates_lens=True)
-    lens = np.flatnonzero(free.columns < len(intrinsics(free.appearance.camera)))
+    free, jacobian = parameters_of(cell, recorded, estimates_lens=True), np.zeros((len(q), 6, size))
+    is_lens = is_of_lens(free)
     stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
-    if len(lens) and seen.any():
-        moved = compress(stack, free.basis, free.appearance, poses[seen]).by_shared
-        turn = compose(poses[seen, :3, :3], np.zeros(3)) @ compose(np.eye(3), -middle)
-        jacobian[np.ix_(seen, np.arange(6), 12 + lens)] = (
-            adjoint(turn) @ moved[:, :, free.columns[lens]]
-        )
-    turn = cell.x[:3, :3]
-    return np.asarray(block_diag(turn, turn) @ jacobian)
+    shown = np.zeros((len(q), 6, len(is_lens)))
+    if is_lens.any() and seen.any():
+        compressed = compress(stack, free.basis, free.appearance, poses[seen])
+        shown[seen] = compressed.by_shared[:, :, free.columns] * is_lens
+    flange = cell.robot.base_from_flange(q)
+    fit = Fit.of_stops(
+        cell.mount, (cell.x, cell.z), flange, cell.noise, effects=[free.effect(shown)]
+    )
+    located = fit.located(next(iter(fit.frames)), np.tile(middle, (len(q), 1)))
+    jacobian[:, :, : located.shape[2]] = located
+    return jacobian
 
 
 def _world(
@@ -314,8 +310,8 @@ def _world(
         # posture of the arm.
         observed = cell.cam_from_target(q) @ [*middle, 1.0]
         position, rotation, point = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
-        position[:, :, 3:6] = point[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
-        point[:, :, :3] = -skew(observed[:, :3])
+        position[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
+        point[:, :, :6] = to_points(observed[:, :3])[:, 3:]
     else:
         position, rotation = workspace_jacobian(cell, purpose, middle)
         point = position
@@ -357,9 +353,8 @@ def workspace_jacobian(
     """
     q = postures(cell.robot)
     flange = cell.robot.base_from_flange(q)
-    problem = chain(cell.mount, flange[:1], seen_from(cell.mount, cell.x, cell.z, flange[:1]))
-    start = State(np.stack([cell.x, cell.z]), np.zeros(0))
-    pair = ArmPair.of(problem, start, problem.robots[0])
+    fit = Fit.of_stops(cell.mount, (cell.x, cell.z), flange[:1], cell.noise)
+    pair = ArmPair.of(fit.problem, fit.state, fit.robots[0])
     basis = np.zeros((len(q), 6, 0))
     if purpose.blocks:
         basis = arm_model(cell.robot, purpose).basis(q)
@@ -377,13 +372,12 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
             next_step="Record q1_rad ..., or plan without the recorded session.",
         )
     joints = np.zeros((recorded.stops, cell.robot.joint_count)) if q is None else q
-    problem = with_arm_errors(cell, purpose, recorded.fit.problem, joints, recorded.arm)
     # Further boards keep their pose relative to the planned one.
     boards = cell.z @ invert(recorded.edges[1]) @ recorded.edges[1:]
-    state = State(np.concatenate([cell.x[None], boards]), problem.start_values)
-    information = fisher_information(problem, state, recorded.fit.noise)
-    edges = 6 * len(problem.unknown)
-    information[edges:, edges:] -= _effect_information(problem)
+    at = replace(recorded.fit.state, edges=np.concatenate([cell.x[None], boards]))
+    fit = with_arm_errors(cell, purpose, recorded.fit.at(at), joints, recorded.arm)
+    information, edges = fit.fisher.copy(), 6 * len(fit.frames)
+    information[edges:, edges:] -= prior_of_effects(fit)
     # Schur complement: the poses of further boards are eliminated.
     further = slice(12, edges)
     cross = np.delete(information[further], further, axis=1)
@@ -391,24 +385,22 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
     return np.delete(np.delete(information, further, axis=0), further, axis=1) - eliminated
 
 
+def prior_of_effects(fit: Fit) -> FloatArray:
+    """Prior information (k, k) of a fit's unknowns but its edges."""
+    priors = (effect.prior.information for effect in fit.problem.effects)
+    return np.asarray(block_diag(np.zeros((0, 0)), *priors))
+
+
 def with_arm_errors(
-    cell: AnyCell, purpose: Purpose, problem: Problem, q: FloatArray, arm: ArmErrors | None = None
-) -> Problem:
-    """Adds errors of the arm to a problem: the purpose's, or those that the stops show."""
+    cell: AnyCell, purpose: Purpose, fit: Fit, q: FloatArray, arm: ArmErrors | None = None
+) -> Fit:
+    """Adds errors of the arm at stops (s, n): the purpose's, or those that the stops show."""
     if purpose.blocks:
-        basis = arm_model(cell.robot, purpose).basis(q)
-        arm = ArmErrors(basis, arm_sigma(purpose), 0.0, of_links=True)
+        basis, sigma = arm_model(cell.robot, purpose).basis(q), arm_sigma(purpose)
+        arm = ArmErrors(basis, sigma, 0.0, of_links=True)
     elif arm is not None:
         arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
-    if arm is None:
-        return problem
-    return problem.with_effects([*problem.effects, arm_effect(arm, problem.robots[0])])
-
-
-def _effect_information(problem: Problem) -> FloatArray:
-    """Prior information (k, k) of a problem's effects."""
-    priors = (effect.prior.information for effect in problem.effects)
-    return np.asarray(block_diag(np.zeros((0, 0)), *priors))
+    return fit if arm is None else fit.with_arm(fit.robots[0], arm)
 
 
 def arm_model(robot: Robot, purpose: Purpose) -> ArmModel:

@@ -13,13 +13,12 @@ from scipy.linalg import block_diag, qr
 
 from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
+from visioncal.core.linalg import gram
 from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.chain import chain
-from visioncal.estimation.problem import ANYTHING, Problem
-from visioncal.estimation.problem_parts import Linear, State
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.problem_parts import ANYTHING
 from visioncal.planning.candidates import unwound
 from visioncal.planning.cell import InstrumentCell
 from visioncal.planning.design import Accuracy, Design, choose_stops
@@ -65,7 +64,7 @@ class InstrumentPlan:
 
     def _phi(self, q: FloatArray) -> FloatArray:
         """Jacobian of the readings by all parameters, in m and rad: the same in mm and mrad."""
-        jacobian = readings(self.cell, self.purpose, q)[1].jacobian
+        jacobian = readings(self.cell, self.purpose, q).slopes
         links = np.tile(TWIST_UNITS, self.cell.robot.joint_count) * arm_sigma(self.purpose)
         if "links" in self.purpose.blocks:
             jacobian[:, :, 12 : 12 + len(links)] *= arm_sigma(self.purpose) / links
@@ -199,34 +198,27 @@ def _candidates(cell: InstrumentCell, possible: int, least: int, seed: int) -> F
     return unwound(cell, collisions, np.array(kept[:possible]))
 
 
-def readings(cell: InstrumentCell, purpose: Purpose, q: FloatArray) -> tuple[Problem, Linear]:
-    """The readings at joints (k, n) [rad] as a problem of the fit, linearised."""
+def readings(cell: InstrumentCell, purpose: Purpose, q: FloatArray) -> Fit:
+    """The readings at joints (k, n) [rad], by the cell's guesses."""
     flange = cell.robot.base_from_flange(q)
-    read = invert(cell.x) @ flange @ cell.z
+    bare = Fit.of_stops(cell.mount, (cell.x, cell.z), flange, cell.noise)
     sigma_rad = cell.instrument.sigma_rad if cell.are_poses else None
     variances = np.full((len(q), 6), ANYTHING if sigma_rad is None else sigma_rad**2)
-    variances[:, 3:] = cell.instrument.sigmas_m(read[:, :3, 3])[:, None] ** 2
-    bare = chain(cell.mount, flange, read, variances[:, :, None] * np.eye(6))
-    problem = with_arm_errors(cell, purpose, bare, q)
-    state = State(np.stack([cell.x, cell.z]), problem.start_values)
-    return problem, problem.linear(state, ideal=True)
+    variances[:, 3:] = cell.instrument.sigmas_m(bare.measured[:, :3, 3])[:, None] ** 2
+    covariance = variances[:, :, None] * np.eye(6)
+    fit = Fit.of_stops(cell.mount, (cell.x, cell.z), flange, cell.noise, covariance)
+    return with_arm_errors(cell, purpose, fit, q)
 
 
 def _world(cell: InstrumentCell, purpose: Purpose, q: FloatArray, recorded: FloatArray) -> World:
     """Information of candidates (k, n) and of recorded stops (r, n) [rad]."""
-
-    def whitened(joints: FloatArray) -> FloatArray:
-        problem, linear = readings(cell, purpose, joints)
-        root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
-        return np.asarray(np.linalg.solve(root, linear.jacobian))
-
-    factors = whitened(q)
+    factors = readings(cell, purpose, q).whitened
     size, arm = factors.shape[2], arm_size(cell.robot, purpose)
     prior = block_diag(np.eye(12) * WEAK_SIGMA**-2.0, arm_sigma(purpose) ** -2.0 * np.eye(arm))
     known = np.zeros((size, size))
     if len(recorded):
-        rows = whitened(recorded).reshape(-1, size)
-        known = rows.T @ rows
+        rows = readings(cell, purpose, recorded).whitened
+        known = gram(rows, rows)
     place, turn = map(mean_square, workspace_jacobian(cell, purpose, np.zeros(3)))
     if not cell.are_poses:
         turn[6:9] = turn[:, 6:9] = 0.0  # A point has no rotation.

@@ -20,14 +20,19 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
+from visioncal.core.prediction import at_points, through
 from visioncal.core.quantiles import chi2_limit, root_of
 from visioncal.core.tolerance_probability import chance_within
-from visioncal.core.transforms import adjoint, compose, invert
-from visioncal.core.types import FloatArray, IntArray, Need
-from visioncal.estimation.appearance import LensBoardParameters
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray, IntArray, Mask, Need
 from visioncal.planning.cell import PlanCell
-from visioncal.planning.information import RecordedStops, World, parameters_of, pick_jacobian
-from visioncal.vision.camera import intrinsics
+from visioncal.planning.information import (
+    RecordedStops,
+    World,
+    is_of_lens,
+    parameters_of,
+    pick_jacobian,
+)
 from visioncal.vision.targets import corner_positions
 
 # Share of sessions that show more noise than a plan counts.
@@ -62,26 +67,24 @@ class Picking:
             if cell.mount == "eye-in-hand":
                 middle = corner_positions(cell.target).mean(axis=0)
                 points = (cell.x @ cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
-                by_flange = adjoint(compose(np.eye(3), -points))
-                covariances += (by_flange * levels[:, None, None]) @ by_flange.mT
+                covariances += at_points(levels[:, None, :, None] * np.eye(6), points)
             sights.append((jacobian, covariances))
         return tuple(sights)
 
     @cached_property
-    def _free(self) -> LensBoardParameters:
-        """Free parameters of lens and boards."""
-        return parameters_of(self.cells[0], self.recorded, estimates_lens=True)
+    def _is_lens(self) -> Mask:
+        """Mask of those free parameters of lens and boards that are the lens's."""
+        return is_of_lens(parameters_of(self.cells[0], self.recorded, estimates_lens=True))
 
-    @cached_property
+    @property
     def lens(self) -> IntArray:
         """Columns of the lens."""
-        free = self._free
-        return 12 + np.flatnonzero(free.columns < len(intrinsics(free.appearance.camera)))
+        return 12 + np.flatnonzero(self._is_lens)
 
-    @cached_property
+    @property
     def boards(self) -> IntArray:
         """Columns of the boards."""
-        return np.setdiff1d(12 + np.arange(len(self._free.columns)), self.lens)
+        return 12 + np.flatnonzero(~self._is_lens)
 
     @cached_property
     def _held(self) -> IntArray:
@@ -130,7 +133,7 @@ class Picking:
             if known is not None and len(known):
                 cross = covariance[:, known]
                 covariance = covariance - cross @ np.linalg.solve(cross[known], cross.T)
-            covariances = jacobian @ covariance @ jacobian.mT
+            covariances = through(jacobian, covariance)
             if not is_exact:
                 covariances += np.einsum("l,lmij->mij", levels, noise)
             chances.append(chance_within(covariances, turn_rad, shift_m, float(freedom[-1])))

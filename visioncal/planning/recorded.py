@@ -6,8 +6,6 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
-from visioncal.calibration.stages.cell_fit import CellFit
-from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.linalg import covariance_among
@@ -15,10 +13,7 @@ from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mount, Progress
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.solve import Solution
-from visioncal.estimation.unknowns import EDGE
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.information import RecordedStops
 from visioncal.robot.arm_model import ArmModel
@@ -81,7 +76,7 @@ def start_from_session(
         raise _missing_input_error(run)
     if run.cell_fit_or_none is None:
         raise _too_vague_error(run)
-    fit = _of_stops(run, run.cell_fit_or_none)
+    fit = _of_stops(run)
     with one_blas_thread():
         edges, covariance = _posterior_edges(fit, run.session.mount)
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
@@ -97,7 +92,7 @@ def start_from_session(
         robot = ArmModel.of(robot, arm.joints_rad, arm.poses).robot
     _, board, *_ = fit.frames
     planned = [*run.session.board_frames.values()].index(board)
-    free = free_parameters_of_camera(fit.linearised)
+    free = fit.lens_and_boards
     cell = PlanCell(
         run.session.mount,
         robot,
@@ -140,20 +135,21 @@ def _with_errors(recorded: RecordedStops, fit: Fit, *, has_joints: bool) -> Reco
     by_arm = fit.by_source.get("arm")
     if has_joints or by_arm is None:
         return recorded
-    index = fit.unknowns.columns(*recorded.fit.unknowns.all_of(EDGE)[:2])
+    index = np.r_[*(fit.problem.edge_columns(frame) for frame in [*recorded.fit.frames][:2])]
     values, vectors = np.linalg.eigh(by_arm[np.ix_(index, index)])
     root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0]
     return replace(recorded, edge_error_root=root)
 
 
-def _of_stops(run: RunState, cell_fit: CellFit) -> Fit:
+def _of_stops(run: RunState) -> Fit:
     """The fit of the stops without errors of the arm, even if it leaves a direction undetermined.
 
     The planned board, which is in the most views, comes first.
     """
-    if cell_fit.linearised_corners is None:
+    fit, arm = run.cell_fit.fit, run.robot_arm
+    if fit.corners is None:
         raise _missing_input_error(run)
-    part, arm = cell_fit.fit.problem, run.robot_arm
+    part = fit.problem
     observed = part.observations.observed
     planned = max(dict.fromkeys(observed), key=observed.count)
     stops, of = np.unique(part.observations.stops, return_inverse=True)
@@ -172,9 +168,9 @@ def _of_stops(run: RunState, cell_fit: CellFit) -> Fit:
         observations=replace(part.observations, stops=of),
         effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     )
-    noise = replace(cell_fit.noise, robots=np.maximum(cell_fit.noise.robots, _LEAST_NOISE.robots))
-    state = problem.start(cell_fit.fit.frames)
-    return Fit(problem, Solution(state, noise), cell_fit.linearised_corners)
+    noise = replace(fit.noise, robots=np.maximum(fit.noise.robots, _LEAST_NOISE.robots))
+    solution = replace(fit.solution, state=problem.start(fit.frames), noise=noise)
+    return Fit(problem, solution, fit.corners)
 
 
 def _posterior_edges(fit: Fit, mount: Mount) -> tuple[FloatArray, FloatArray]:
@@ -196,8 +192,7 @@ def _posterior_edges(fit: Fit, mount: Mount) -> tuple[FloatArray, FloatArray]:
         # Shared parameters have converged before; they are marginalised, but not moved.
         step[6 * len(edges) :] = 0.0
         fit = fit.at(fit.state.moved(step))
-    information = fisher_information(problem, fit.state, fit.noise) + weights
-    return fit.state.edges, covariance_among(information, problem.counted)[:12, :12]
+    return fit.state.edges, covariance_among(fit.fisher + weights, problem.counted)[:12, :12]
 
 
 def _missing_input_error(run: RunState) -> DataError:

@@ -8,7 +8,7 @@ from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.stages.validate import HeldOutResiduals, needed_frames, pose_residuals
 from visioncal.core.directions import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.core.prediction import sigmas_of, through, to_points, total_of
+from visioncal.core.prediction import sigmas_of, through, total_of
 from visioncal.core.quantiles import radius95
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply_each
@@ -94,11 +94,8 @@ def uncertainty_of(cell_fit: CellFit, fit: Fit) -> UncertaintyResult:
     points = np.array([middles.get(name, np.zeros(3)) for name in seen])
     points_cam = apply_each(fit.problem.measured(fit.state), points)
     distances_m, point_cam = np.linalg.norm(points_cam, axis=1), points_cam.mean(axis=0)
-    # Each view's middle, in the frame that carries the camera.
-    rows = np.flatnonzero(np.array(fit.seen.observers) == camera)
-    jacobian = fit.closure(rows, fit.tree.branches[camera].parent).linear.jacobian
-    places = apply_each(np.broadcast_to(fit.frames[camera], (len(rows), 4, 4)), points_cam[rows])
-    by_unknowns = (to_points(places) @ jacobian)[:, 3:]
+    by_camera = np.array(fit.seen.observers) == camera
+    by_unknowns = fit.located(camera, points[by_camera])[:, 3:]
     parts = {
         name: through(by_unknowns, array).mean(axis=0)
         for name, array in _by_source(cell_fit, fit).items()

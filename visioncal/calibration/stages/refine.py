@@ -9,29 +9,14 @@ import numpy as np
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
-from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
-from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
+from visioncal.estimation.appearance import LensBoardParameters, compress
+from visioncal.estimation.effects.lenses import CameraParameters
 from visioncal.estimation.joint import diverging, fit_jointly, others_of
 from visioncal.vision.corners import CornerStack, floored_sigma_px
 from visioncal.vision.pnp import ViewPoses
 
 # Prior sigma of a printed board's scale, as a share: prints are scaled to fit a page.
 PRINTED_SCALE = 0.03
-
-
-def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
-    """Lens and boards of the only camera, and their covariance."""
-    cameras, prior = seen.camera_parameters, seen.known
-    ((name, problem),) = cameras.problems.items()
-    return LensBoardParameters(
-        Appearance(cameras.camera(name), cameras.values[cameras.boards]),
-        problem.basis,
-        problem.positions,
-        seen.free,
-        seen.held,
-        prior.information,
-        prior.gradient,
-    )
 
 
 def refine_jointly(cell_fit: CellFit, optics: CameraParameters) -> CellFit:
