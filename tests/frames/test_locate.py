@@ -25,7 +25,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Corners
 from visioncal.frames.camera_chain import Plane
-from visioncal.frames.locate import locate, locate_target
+from visioncal.frames.locate import locate, locate_by_depth, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.touch_test import (
     evaluate_gaps,
@@ -92,6 +92,27 @@ def test_jacobians_of_a_ray_agree_with_central_differences(exact_cell, beyond):
     # The field is taken for flat where a pixel errs: by up to 0.3 px in a fifth of 1280.
     apart = (1e-2 if beyond else 1e-5) * np.sum(by_px**2)
     np.testing.assert_allclose(parts["pixels"], by_px.T @ by_px, atol=apart)
+
+
+def test_a_focus_that_varies_counts_on_planes_and_by_depth(exact_cell):
+    (cell, calibration), rng, share = exact_cell, np.random.default_rng(2), 2e-3
+    at, centre = stand(cell, rng), calibration.camera.camera.matrix[2:]
+    place, px = seen_point(cell, at, rng)
+    field = replace(with_field(calibration).camera.field, coefficients=np.zeros(0), jitter=share)
+    field = replace(field, field_px=0.0, breathing=0.0, root=np.zeros((0, 0)))
+    field = replace(
+        field, intrinsics_covariance=np.zeros((0, 9)), edge_covariance=np.zeros((0, 12))
+    )
+    varying = replace(calibration, camera=replace(calibration.camera, field=field))
+    depth_m = float((invert(at.base_from_cam) @ [*place, 1.0])[2])
+    plane = Plane.through(at.base_from_cam[:3, 2], place)
+    by_depth, on_plane = (
+        lambda of, px: locate_by_depth(of, px, depth_m, at.base_from_flange)[0],
+        lambda of, px: locate(of, px, plane, at.base_from_flange)[0],
+    )
+    for found in (by_depth, on_plane):
+        by_focus = slopes(lambda by, of=found: of(calibration, centre + (1 + by) * (px - centre)))
+        agrees(found(varying, px).parts["focus"] / share**2, by_focus)
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])

@@ -131,17 +131,11 @@ def locate_by_depth(
         by_depth = -model.by_values(depth[None] * along, where, by.resolution).T / along
         # The first ray is for the mean distance, as in `_on_plane`.
         unit = np.append(normalise(eye.camera, eye.lens.in_model(at[None], depth))[0], 1.0)
-        point_cam = depth * unit
-        (by_px,), (by_lens,) = eye.lens.rays_by_lens(at[None], point_cam[None], depth)
-        by_cam = cam_pose.base_from_cam[:3, :3]
-        by_noise = (noise_m * by_cam @ unit)[:, None]
+        point_cam, along_ray = depth * unit, cam_pose.base_from_cam[:3, :3] @ unit
+        by_values = (np.outer(along_ray, by_depth), model.covariance, cross)
         parts = {
-            "pixels": through(noise_px * by_cam @ by_px, np.eye(2)),
-            "depth": through(by_noise, np.eye(1)),
-            **_camera_parts(
-                *(eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ by_lens),
-                (np.outer(by_cam @ unit, by_depth), model.covariance, cross),
-            ),
+            "depth": noise_m**2 * np.outer(along_ray, along_ray),
+            **_ray_parts(eye, cam_pose, at, point_cam, noise_px, depth=by_values),
         }
         warnings = (*filter(None, [unread]), *_distance_warning(eye, point_cam))
         found.append(_located(eye, cam_pose.point(point_cam), parts, warnings))
@@ -283,16 +277,10 @@ def _on_plane(
     p_base = cam_pose.point(point_cam)
     # Projection along the ray onto the plane, where the point stays.
     projection = np.eye(3) - np.outer(along, plane.normal) / rise
-    (by_px,), (by_lens,) = eye.lens.rays_by_lens(px[None], point_cam[None], depth)
-    by_cam = projection @ cam_pose.base_from_cam[:3, :3]
-    by_focus = eye.jitter * by_cam @ by_px @ (px - eye.camera.matrix[2:])
-    by_camera = projection @ cam_pose.camera_jacobian(point_cam)
     by_plane = np.outer(along / rise, np.append(-p_base, 1.0))
     parts = {
-        "pixels": through(noise_px * by_cam @ by_px, np.eye(2)),
-        "focus": np.outer(by_focus, by_focus),
         "plane": through(by_plane, plane.covariance),
-        **_camera_parts(eye, cam_pose, by_camera, by_cam @ by_lens),
+        **_ray_parts(eye, cam_pose, px, point_cam, noise_px, projection),
     }
     return _located(eye, p_base, parts, _distance_warning(eye, point_cam))
 
@@ -301,6 +289,32 @@ _LOOK_AT_PLANE = (
     "Check the plane (in the base; --plane is in mm) and the robot's pose (base_from_flange, no "
     "inverse)."
 )
+
+
+def _ray_parts(
+    eye: CalibratedCamera,
+    cam_pose: CameraPose,
+    px: FloatArray,
+    point_cam: FloatArray,
+    noise_px: float,
+    projection: FloatArray | None = None,
+    depth: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+) -> dict[str, FloatArray]:
+    """Covariance parts of a point on the ray of a pixel (2,), by all but its distance.
+
+    `projection` (3, 3) is that of its errors in the base, onto where the point stays; `depth` is
+    as in `_camera_parts`.
+    """
+    onto = np.eye(3) if projection is None else projection
+    (by_px,), (by_lens,) = eye.lens.rays_by_lens(px[None], point_cam[None], float(point_cam[2]))
+    by_cam = onto @ cam_pose.base_from_cam[:3, :3]
+    by_focus = eye.jitter * by_cam @ by_px @ (px - eye.camera.matrix[2:])
+    by_camera = onto @ cam_pose.camera_jacobian(point_cam)
+    return {
+        "pixels": through(noise_px * by_cam @ by_px, np.eye(2)),
+        "focus": np.outer(by_focus, by_focus),
+        **_camera_parts(eye, cam_pose, by_camera, by_cam @ by_lens, depth),
+    }
 
 
 def _camera_parts(
