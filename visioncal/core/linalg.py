@@ -13,6 +13,8 @@ _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
 # Share of a variance, or of an information, below which what is left is rounding.
 ROUNDING = 1e-6
+# Bounds of standard deviations that are estimated, in units of the residuals [rad and m].
+LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
 # Share of the largest eigenvalue below which a direction is undetermined.
 NULL_SHARE = 1e-8
 

@@ -9,20 +9,23 @@ The points of a rig deviate from its table by their stated standard deviations; 
 board whose images show that they are elsewhere deviate in its plane, beside its shape.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from visioncal.core.linalg import covariance_from
+from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.vision.camera import intrinsics, with_intrinsics
-from visioncal.vision.corners import CornerStack, WithoutPoses, reproject
+from visioncal.vision.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.vision.field_modes import FieldModes, field_modes
 from visioncal.vision.lens_field import Coefficients, LensLevels, breathing_columns, lens_part
+from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.poses import fit_poses
 
 # The effect's name in a problem.
@@ -66,6 +69,30 @@ class LensBoardParameters:
         """The parameters as an effect on observations, given their (m, 6, k) Jacobian."""
         prior = PriorInformation(self.information, self.gradient)
         return replace(Effect.free(LENS_AND_BOARD, prior, shift), held=self.anchored)
+
+    def posed(self, views: Sequence[ViewPoses], sigma_px: float) -> tuple[ViewPoses, ...]:
+        """Poses of views that are not in the fit, by their corners with this lens and these boards.
+
+        Each view has its one pose and its corners; `sigma_px` is the noise of a corner's
+        coordinate.
+        """
+        if not views:
+            return ()
+        corners = {view.view: view.corners for view in views if view.corners is not None}
+        starts = np.array([view.cam_from_target[0] for view in views])
+        with one_blas_thread():
+            stack = CornerStack.of(corners, self.positions)
+            compressed = compress(stack, self.basis, self.appearance, starts)
+        covariances = floored_sigma_px(sigma_px) ** 2 * compressed.covariance
+        return tuple(
+            replace(
+                view,
+                cam_from_target=compressed.cam_from_target[at][None],
+                covariance=covariances[at][None],
+                shared_jacobian=compressed.by_shared[at][None, :, self.columns],
+            )
+            for at, view in enumerate(views)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.special import expit
 
 from visioncal.core.limits import FEWEST_STOPS
+from visioncal.core.linalg import LEAST_SIGMA
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.robot_likelihood import RobotLikelihood

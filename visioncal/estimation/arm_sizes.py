@@ -23,9 +23,9 @@ import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.special import ive
 
-from visioncal.core.linalg import gram
+from visioncal.core.linalg import LEAST_SIGMA, MOST_SIGMA, gram
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedEstimate
+from visioncal.estimation.mixed import MixedEstimate
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood

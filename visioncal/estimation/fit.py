@@ -83,13 +83,17 @@ class Fit:
     def of_stops(
         cls,
         mount: Mount,
-        edges: tuple[FloatArray, FloatArray],
+        edges: Sequence[FloatArray] | FloatArray,
         base_from_flange: FloatArray,
         noise: Noise,
         covariance: FloatArray | None = None,
         effects: Sequence[Effect] = (),
+        *,
+        measured: FloatArray | None = None,
+        targets: Sequence[str] = (),
+        order: Sequence[str] = (),
     ) -> "Fit":
-        """Stops that are yet to be taken by one robot and one camera, with what they would show.
+        """Stops of one robot and one camera, one view each, by known edges; nothing is fitted.
 
         Args:
             mount: Mounting of the camera.
@@ -98,12 +102,19 @@ class Fit:
             noise: Noise of the flange.
             covariance: (s, 6, 6) of the poses that are measured there; None where unknown.
             effects: Effects common to many views.
+            measured: (s, 4, 4) these poses; None for stops that are yet to be taken.
+            targets: See `chain`.
+            order: See `chain`.
         """
-        x, z = edges
-        measured = invert(robot_part(base_from_flange, mount) @ x) @ z
-        problem = chain(mount, base_from_flange, measured, covariance, effects=effects)
-        state = State(np.stack([x, z]), problem.start_values)
-        return cls(problem, Solution(state, noise))
+        if measured is None:
+            measured = invert(robot_part(base_from_flange, mount) @ edges[0]) @ edges[1]
+        problem = chain(
+            *(mount, base_from_flange, measured, covariance),
+            targets=targets,
+            order=order,
+            effects=effects,
+        )
+        return cls(problem, Solution(State(np.stack([*edges]), problem.start_values), noise))
 
     @property
     def state(self) -> State:

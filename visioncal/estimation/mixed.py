@@ -18,6 +18,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.linalg import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
     NULL_SHARE,
     ROUNDING,
     covariance_root,
@@ -31,8 +33,6 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 # Typical translation to rotation noise of arms and cameras [m/rad]: median, and standard deviation
 # of its logarithm, a factor of five.
 TYPICAL_RATIO, RATIO_LOG_SIGMA = 0.6, 1.5
-# Bounds of the standard deviations, in units of the residuals [rad and m].
-LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
 # Most change of a size's logarithm in one step.
 _LONGEST_STEP = 1.5
 # A smaller gain of log-likelihood corresponds to a hundredth of the levels' uncertainty.

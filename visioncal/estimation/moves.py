@@ -14,7 +14,6 @@ from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, by_noise_alone
@@ -112,8 +111,7 @@ class Creep(Effect):
         """The motion of a frame of a problem, linearised at a state."""
         jacobian = problem.linear(state, ideal=True).jacobian[:, :, problem.edge_columns(frame)]
         left = still_to_come(_progress(problem.observations.stops, problem), rate)
-        flat = PriorInformation.flat(6)
-        free = cls.free(f"{CREEP} of {frame}", flat, jacobian * left[:, None, None])
+        free = cls.free(f"{CREEP} of {frame}", by_sensor=jacobian * left[:, None, None])
         return replace(free, frame=frame, rate=rate)
 
 

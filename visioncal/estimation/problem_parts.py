@@ -99,12 +99,14 @@ class Effect:
     def free(
         cls,
         name: str,
-        known: PriorInformation,
+        known: PriorInformation | None = None,
         by_sensor: FloatArray | None = None,
         flange_jacobian: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> Self:
-        """An effect of free values, linearised at zero."""
-        size = len(known.gradient)
+        """An effect of free values, linearised at zero; without a prior where None is known."""
+        jacobians = [*flange_jacobian.values(), *([] if by_sensor is None else [by_sensor])]
+        size = jacobians[0].shape[2]
+        known = PriorInformation.flat(size) if known is None else known
         return cls(
             name, np.zeros(size), known, np.zeros(size, dtype=bool), by_sensor, flange_jacobian
         )

@@ -19,7 +19,6 @@ from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.transforms import adjoint, apply, compose, invert, log, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask, evenly
 from visioncal.estimation.arm import rows_of, stops_of
-from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.moves import CREEP, Creep, fitted_change, moved
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
@@ -112,9 +111,7 @@ def joints_of(problem: Problem, offsets: Mapping[str, FloatArray]) -> list[Candi
             robot,
             _between(problem, rows_of(problem, robot)),
             Effect.free(
-                f"offset {joint} of {robot}",
-                PriorInformation.flat(1),
-                flange_jacobian={robot: offset[:, :, [joint]]},
+                f"offset {joint} of {robot}", flange_jacobian={robot: offset[:, :, [joint]]}
             ),
             joint,
         )
@@ -129,7 +126,7 @@ def sizes_of(problem: Problem, fit: Solution) -> list[Candidate]:
     for frame in (name for name in problem.unknown if name.startswith("target")):
         rows = np.array([name == frame for name in problem.observations.observed])
         jacobian = np.where(rows[:, None], by_sizes, 0.0)[:, :, None]
-        effect = Effect.free(f"size of {frame}", PriorInformation.flat(1), jacobian)
+        effect = Effect.free(f"size of {frame}", by_sensor=jacobian)
         candidates.append(Candidate(SIZE, frame, _between(problem, rows), effect))
     return candidates
 
@@ -140,9 +137,7 @@ def drift_of(problem: Problem, robot: str) -> Candidate:
     jacobian = np.zeros((len(poses), 6, 6))
     time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
     jacobian[stops] = adjoint(invert(poses[stops])) * time
-    effect = Effect.free(
-        f"drift of {robot}", PriorInformation.flat(6), flange_jacobian={robot: jacobian}
-    )
+    effect = Effect.free(f"drift of {robot}", flange_jacobian={robot: jacobian})
     first = int(problem.observations.stops.min())
     return Candidate(DRIFT, robot, np.array([first]), effect)
 

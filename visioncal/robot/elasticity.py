@@ -11,6 +11,8 @@ from visioncal.robot.model import Robot
 
 # Prior of a compliance of which nothing is known: a gear of 10 kN m/rad [rad/(N m)].
 SOFT = 1e-4
+# Beginning of a remark on the springs.
+BENDS = "The joints bend under load"
 BY_CONTROLLER, OF_MASSES = "compensated by the controller", "of the model's masses"
 
 

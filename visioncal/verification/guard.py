@@ -7,16 +7,13 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.core.arguments import check_fields, typed
 from visioncal.core.codec import within
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import invert, rigid_fault, robot_part
 from visioncal.core.types import Corners, FloatArray
-from visioncal.estimation.arm import arm_effect
-from visioncal.estimation.chain import chain
-from visioncal.estimation.problem_parts import ROBOT, Effect
+from visioncal.estimation.fit import Fit
 from visioncal.results import Calibration
 from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.errors import TURN_PER_M, ArmErrors, link_basis, posture_features
@@ -282,7 +279,7 @@ class Guard:
                 next_step="Name the one that it shows.",
             )
         board = prior.boards[0] if not look.target else targets.index(look.target)
-        flange, effects, fitted = look.base_from_flange, list[Effect](), prior.fit.arm
+        flange, errors, fitted = look.base_from_flange, None, prior.fit.arm
         edges = len(self._gain.T)
         offsets = np.zeros((6, len(self._units) - edges))
         missing = {
@@ -314,22 +311,24 @@ class Guard:
                 robot, is_of_links = self._arm.robot, fitted.of == "links"
                 basis = link_basis(robot, joints) if is_of_links else self._arm.basis(joints)
                 errors = ArmErrors(basis, 1.0, np.inf, of_links=True)
-                effects = [arm_effect(errors, ROBOT, values=np.zeros(basis.shape[2]))]
         flange = np.eye(4) if flange is None else flange
-        pose, covariance = self._posed(look, board, flange, label), None
+        pose, covariance, effects = self._posed(look, board, flange, label), None, []
         if self._free is not None:
             covariance = pose.covariance[:1]
-            effects = [self._free.effect(pose.shared_jacobian[:1]), *effects]
-        problem = chain(
+            effects = [self._free.effect(pose.shared_jacobian[:1])]
+        fit = Fit.of_stops(
             prior.calibration.mount,
+            prior.state.edges,
             flange[None],
-            pose.cam_from_target[:1],
+            self._noise,
             covariance,
+            effects,
+            measured=pose.cam_from_target[:1],
             targets=(self._boards[prior.boards.index(board)],),
             order=self._boards,
-            effects=effects,
         )
-        linear = problem.linear(prior.state)
+        fit = (fit if errors is None else fit.with_arm(fit.robots[0], errors)).at(prior.state)
+        linear = fit.problem.linear(fit.state)
         # A true difference acts against the prediction.
         jacobian = -linear.jacobian[0]
         by_edges, by_values = jacobian[:, :edges], jacobian[:, edges:]
@@ -339,7 +338,7 @@ class Guard:
         return LookRows(
             time_s=look.time_s,
             residual=linear.residuals[0],
-            covariance=problem.total_covariance(linear, self._noise)[0]
+            covariance=fit.problem.total_covariance(linear, self._noise)[0]
             + by_values @ self._rest @ by_values.T
             - (1.0 - 0.1) * by_arm,
             by_edges=by_edges + by_values @ self._gain,
@@ -394,7 +393,7 @@ class Guard:
             )
         seen = replace(seen, px=px)
         view = ViewPoses(0, seen, start[None], (0,), none, none[:, :, :0], board, int(first))
-        return recompute_poses([view], free, calibration.noise["pixel_px"])[0]
+        return free.posed([view], calibration.noise["pixel_px"])[0]
 
     @property
     def document(self) -> dict[str, Any]:

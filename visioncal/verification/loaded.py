@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.calibration.stages.elastic import BENDS
 from visioncal.calibration.stages.readings import read_instrument, stops_of_views
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CONTRADICTION, DETERMINED
@@ -23,7 +22,7 @@ from visioncal.results import Calibration
 from visioncal.results.arm import ElasticResult, JointSpring, Sag
 from visioncal.robot import Loads
 from visioncal.robot.arm_model import COMPLIANCE, ArmModel
-from visioncal.robot.elasticity import SOFT, weight_words
+from visioncal.robot.elasticity import BENDS, SOFT, weight_words
 from visioncal.robot.loads import load_ranges
 from visioncal.session import Session
 from visioncal.session.table import loads_of

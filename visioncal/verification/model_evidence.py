@@ -25,9 +25,9 @@ from itertools import product
 import numpy as np
 from scipy.linalg import block_diag, cholesky, solve_triangular
 
+from visioncal.core.linalg import LEAST_SIGMA
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.robot.errors import SIZES_M
@@ -238,8 +238,8 @@ def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Pro
     observations = problem.observations
     sensor, by_sensor = _stepped(cause.by_sensor, values, len(problem))
     flange, by_flange = _stepped(cause.flange_jacobian, values, len(poses))
-    adjoints, no_prior = adjoint(invert(sensor)), PriorInformation.flat(len(values))
-    changed = Effect.free("change", no_prior, by_sensor, {robot: by_flange})
+    adjoints = adjoint(invert(sensor))
+    changed = Effect.free("change", None, by_sensor, {robot: by_flange})
     return replace(
         problem,
         poses={robot: poses @ flange},

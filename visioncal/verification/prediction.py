@@ -9,7 +9,6 @@ import numpy as np
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
-from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, listed
 from visioncal.core.transforms import invert, log, robot_part
@@ -106,7 +105,7 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
         if lens is not None and look.resolution is not None:
             check_resolution(run.session, prior.calibration, look.resolution)
             plain = CameraResult(lens.camera, estimated=False)
-            run = run.with_camera(frame, replace(_in_lens_model(look, lens, {}), lens=plain))
+            run = run.with_camera(frame, replace(look.in_model(lens), lens=plain))
     if lens is not None and lens.field is not None and lens.field.breathing != 0.0:
         # Breathing is corrected to the calibration's mean distance, by rough poses.
         positions = numbered_positions(tuple(run.session.boards.values()))
@@ -117,7 +116,7 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
                 stack = CornerStack.of(shown, positions)
                 poses = np.array([rough_poses[view].cam_from_target[0] for view in stack.views])
                 depths = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
-                corrected = _in_lens_model(look, lens, depths).corners
+                corrected = look.in_model(lens, depths).corners
                 run = run.with_camera(frame, replace(run.cameras[frame], corners=corrected))
     # Of a sweep the slower views are used, where the error of the clock offset is below the
     # robot's.
@@ -127,17 +126,6 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     observed = _with_poses(_with_arm(run, prior), prior)
     problem, warnings = observed.problem(observed.used), tuple(_warnings(observed, prior))
     return PredictedStops(observed, problem, observed.used, warnings, run)
-
-
-def _in_lens_model(
-    look: CameraObservations, lens: CameraResult, depths: Mapping[int, float]
-) -> CameraObservations:
-    """Corrects the corners of views for the lens's errors beyond its model."""
-    corners = {
-        view: replace(detected, px=lens.in_model(detected.px, depths.get(view)))
-        for view, detected in look.corners.items()
-    }
-    return replace(look, corners=corners)
 
 
 def board_changes(problem: Problem, state: State) -> FloatArray:

@@ -9,7 +9,6 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.core.types import IntArray
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain
@@ -47,7 +46,7 @@ class ObservedPoses(Observed):
                 for view in given.values()
                 if view.corners is not None and len(view.cam_from_target) == 1
             ]
-            given |= {view.view: view for view in recompute_poses(single, self.free, pixel_px)}
+            given |= {view.view: view for view in self.free.posed(single, pixel_px)}
         return replace(self, poses={**self.poses, **given})
 
     @cached_property

@@ -14,7 +14,7 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag, TwoSlopes
 from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
-from visioncal.robot.elasticity import BY_CONTROLLER, OF_MASSES, SOFT, weight_words
+from visioncal.robot.elasticity import BENDS, BY_CONTROLLER, OF_MASSES, SOFT, weight_words
 from visioncal.robot.errors import ArmErrors
 from visioncal.robot.loads import STANDARD_GRAVITY_M_S2, load_ranges
 
@@ -99,8 +99,7 @@ class _Slopes:
         fit, robot = self.arm.fit, self.arm.robot
         jacobian = np.zeros((len(fit.problem.poses[robot]), 6, len(turns)))
         jacobian[self.arm.stops] = np.stack(turns, axis=2)
-        prior = PriorInformation.flat(len(turns))
-        widened = fit.with_columns(Effect.free("slopes", prior, flange_jacobian={robot: jacobian}))
+        widened = fit.with_columns(Effect.free("slopes", flange_jacobian={robot: jacobian}))
         return -widened.absorbed @ widened.equations[1], widened.absorbed
 
     def next(self, knees: Mapping[int, float]) -> tuple[int, float] | None:
@@ -184,9 +183,6 @@ def _payload_factor(arm: ArmData) -> Factor | None:
         values = values + np.linalg.solve(normal, jacobian.T @ information @ (found - predicted))
     sigma = float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
     return Factor(1.0 + float(values[-1]), sigma) if sigma < 1.0 else None
-
-
-BENDS = "The joints bend under load"
 
 
 def remarks(elastic: ElasticResult) -> Iterator[str]:

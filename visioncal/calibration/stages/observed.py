@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Self
 
 from visioncal.calibration.stages.clock_offset import ClockedViews, ClockPair
@@ -31,6 +32,16 @@ class CameraObservations:
     resolution: tuple[int, int] | None = None  # Size of its images [px].
     lens: CameraResult | None = None  # Its intrinsics; None where no view determines them.
     pixel_px: float | None = None  # Noise of a corner's coordinate [px].
+
+    def in_model(
+        self, lens: CameraResult, depths_m: Mapping[int, float] = MappingProxyType({})
+    ) -> Self:
+        """Corrects corners, of views at known distances, for a lens's errors beyond its model."""
+        corners = {
+            view: replace(detected, px=lens.in_model(detected.px, depths_m.get(view)))
+            for view, detected in self.corners.items()
+        }
+        return replace(self, corners=corners)
 
 
 @dataclass(frozen=True, eq=False)
