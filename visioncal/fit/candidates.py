@@ -154,8 +154,10 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
         is_free = fit.cell.cameras[camera].intrinsics != "hold" or ("lens", camera) in fit.unknowns
         is_free &= camera not in fit.unknowns.fields
         if is_free and images_of(pairs, camera):
-            field, size, gain = best_field(fit, pairs, camera)
-            yield Candidate(gain, lens_field(camera, field, size), field=field)
+            found = best_field(fit, pairs, camera, SIGNIFICANT)
+            if found is not None:
+                field, size, gain = found
+                yield Candidate(gain, lens_field(camera, field, size), field=field)
 
 
 def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:

@@ -247,7 +247,7 @@ def added_by_displacements(
         poses = gram.poses[pair.owner]
         points = apply_each(poses, pair.points[pair.ids] + shape)
         slopes = project_with_jacobian(lens, points).jacobian_point
-        moved = np.stack([one.moved(points, poses)[:, :, 0] for one in tried], axis=2)
+        moved = np.stack([one.moved_first(points, poses) for one in tried], axis=2)
         shares = tried[0].columns(gram.moments, gram.distances)[pair.owner, 0, 0] * pair.weights
         each = slopes @ moved * shares[:, None, None]
         by_field = np.stack([np.kron(axis, rows.functions) for axis in np.eye(2)], axis=1)
@@ -314,8 +314,13 @@ def _of_images(fit: Fit, images: Sequence[Pair]) -> Iterator[tuple[Gram, Pair, C
             yield gram, pair, corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
 
 
-def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, float, float]:
-    """The most likely field of a lens, its size [px], and its log-likelihood against none."""
+def best_field(
+    fit: Fit, pairs: Sequence[Pair], camera: str, limit: float
+) -> tuple[Field, float, float] | None:
+    """The most likely field of a lens, its size [px], and its log-likelihood against none.
+
+    None where twice that is below a limit.
+    """
     found, options = of_waves(fit, pairs, camera), list[tuple[float, float, Field]]()
     px = np.concatenate([pair.px for pair in images_of(pairs, camera)])
     weight = max(_weight(fit, gram) for gram in fit.grams if gram.pair[0] == camera)
@@ -323,6 +328,8 @@ def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, flo
         size, gain = found.best(np.tile(field.sigmas, 2), 1e-4, 5.0)
         options.append((gain, size, field))
     gain, size, field = max(options, key=lambda option: option[0])
+    if 2.0 * gain < limit:
+        return None
     # Of a function below this, all corners together show nothing. Least size of a function of the
     # field, over the uncertainty with which all corners show it.
     return field.shown(px, 0.5**2 / (size**2 * weight)), size, gain

@@ -257,7 +257,7 @@ def _of_corners(
 ) -> _Options | None:
     px, points = corners.px, corner_positions(board)[corners.ids]
     poses = closed_form_poses(points, plane)
-    away = [project(lens, apply(pose, points)) - px for pose in poses]
+    away = project(lens, apply(poses, points).reshape(-1, 3)).reshape(-1, *px.shape) - px
     off = np.array([np.sqrt(np.nanmean(each**2)) for each in away])
     if not np.isfinite(off).any():
         return None

@@ -48,7 +48,7 @@ def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
 
     Points that are not in front of the camera give NaN.
     """
-    return project_with_jacobian(camera, points_cam).px
+    return project_with_jacobian(camera, points_cam, lens=False).px
 
 
 def project_with_jacobian(

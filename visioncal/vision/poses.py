@@ -4,6 +4,7 @@ A planar target has two closed-form solutions, which look almost alike.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -99,11 +100,16 @@ def determines_pose(points: FloatArray) -> bool:
 
     A line through all points but one contains two of any three: three lines are enough to try.
     """
-    if len(points) < FEWEST_CORNERS:
-        return False
-    starts, span = points[[0, 0, 1]], float(np.ptp(points, axis=0).max())
-    along = points[[1, 2, 2]] - starts
-    # Called for every view: `np.cross` takes ten times as long.
+    return len(points) >= FEWEST_CORNERS and _off_every_line(np.asarray(points, float).tobytes())
+
+
+# Nearly all views show the same corners of a board.
+@lru_cache(maxsize=1024)
+def _off_every_line(data: bytes) -> bool:
+    """Whether at least two of (n, 3) points, as bytes, lie off every line."""
+    points = np.frombuffer(data).reshape(-1, 3)
+    starts = points[[0, 0, 1]]
+    along, span = points[[1, 2, 2]] - starts, float(np.ptp(points, axis=0).max())
     distances = np.linalg.norm((points - starts[:, None]) @ skew(along), axis=2)
     # Relative distance from a line below which points are collinear.
     is_off = distances > 1e-6 * span * np.linalg.norm(along, axis=1)[:, None]

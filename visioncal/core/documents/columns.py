@@ -177,12 +177,15 @@ class TableReader(NumberChecks):
         `needed` names what every row has to have; empty where rows may be without.
         """
         values: list[_T | None] = []
+        # Numbers of views and corners recur by the thousand.
+        known: dict[str, _T | None] = {"": None}
         for row, cell in enumerate(self.texts(name)):
-            value = None
-            try:
-                value = convert(cell) if cell else None
-            except DataError as error:
-                self.report(row, name, error.message.rstrip("."), error.next_step)
+            value = known.get(cell)
+            if cell not in known:
+                try:
+                    value = known[cell] = convert(cell)
+                except DataError as error:
+                    self.report(row, name, error.message.rstrip("."), error.next_step)
             if not cell and needed:
                 self.report(row, name, f"it is empty, but must be {needed}")
             values.append(value)
@@ -245,7 +248,7 @@ def as_number(cell: str) -> float:
     """Reads a finite number; raises DataError."""
     # float() alone also accepts 1_000 and digits of other scripts.
     value = float(cell) if is_number(cell) else math.nan
-    if THOUSANDS.fullmatch(cell):
+    if "," in cell and THOUSANDS.fullmatch(cell):
         raise DataError(
             f"{cell!r} may have a decimal comma or separated thousands",
             next_step=f"Write {cell.replace(',', '.')} or {cell.replace(',', '')}, in all rows.",

@@ -98,7 +98,9 @@ def _with_points(
 ) -> list[tuple[int, tuple[str, ...]]]:
     """Rows with decimal points; between commas only where some number shows what its comma is."""
     split = list(rows)
-    marks = [cell for _, row in split for cell in row if _DECIMAL_COMMA.fullmatch(cell)]
+    marks = [
+        cell for _, row in split for cell in row if "," in cell and _DECIMAL_COMMA.fullmatch(cell)
+    ]
     if separator == "," and all(map(THOUSANDS.fullmatch, marks)):
         return split
     points = {cell: cell.replace(",", ".") for cell in marks}

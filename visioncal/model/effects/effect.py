@@ -151,6 +151,10 @@ class Displacement(Effect):
             poses: (n, 4, 4) or (4, 4) `cam_from_board` of their boards.
         """
 
+    def moved_first(self, points: FloatArray, poses: FloatArray) -> FloatArray:
+        """(n, 3) of `moved` by the first value alone."""
+        return self.moved(points, poses)[:, :, 0]
+
 
 @dataclass(frozen=True, eq=False)
 class LensEffect(Effect):

@@ -50,11 +50,18 @@ class Window(Displacement):
     def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
         """See `Displacement`."""
         del poses
-        axis = np.array([[0.0, 0.0, 1.0]])
-        still, *turned = (
-            nearer(axis, normal) - nearer(points, normal) for normal in self._normals()
-        )
+        still, *turned = (self._shift(points, normal) for normal in self._normals())
         return np.stack([still, *((at - still) / _STEP for at in turned)], axis=2)
+
+    def moved_first(self, points: FloatArray, poses: FloatArray) -> FloatArray:
+        """See `Displacement`."""
+        del poses
+        return self._shift(points, np.array(self.normal))
+
+    @staticmethod
+    def _shift(points: FloatArray, normal: FloatArray) -> FloatArray:
+        """(n, 3) of (n, 3) points, less that of the optical axis."""
+        return nearer(np.array([[0.0, 0.0, 1.0]]), normal) - nearer(points, normal)
 
     def _tangents(self) -> FloatArray:
         """(2, 3) unit vectors across the normal."""
