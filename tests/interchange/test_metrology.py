@@ -1,14 +1,17 @@
 """Tables of measured points, written as metrology programs do: each gives the same session."""
 
+import json
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 
 from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import invert
+from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import THREE, InstrumentOptions, tracked
@@ -215,6 +218,60 @@ def test_loads_stand_in_columns_or_in_the_names_of_groups(tmp_path, heads, cells
     for name, value in load.items():
         assert [view.numbers[name] for view in views[STOPS:]] == [pytest.approx(value)] * STOPS
     np.testing.assert_allclose(views[0].joints_rad, views[STOPS].joints_rad)
+
+
+def test_angles_without_headings_stand_beside_points_in_turn(tmp_path):
+    """Three points at each stop in one list, and the joints in a file that is called by angles."""
+    world = shop(3)
+    points = [[f"{1e3 * value:.7f}" for value in pose[:3, 3]] for *_, pose in world.rows]
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/POSES.txt").write_text(joined(points, " "))
+    states = joined([angles(stop, 3) for stop in range(STOPS)], " ")
+    (tmp_path / "in/AnglesInDeg.txt").write_text(states)
+    said = ("--mount", "instrument", "--robot-model", "ur10e")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    assert "3 points are taken in turn at each stop" in done.err
+    views = Session.load(tmp_path / "out").views
+    assert len(views) == 3 * STOPS
+    for view, (stop, _, pose) in zip(views, world.rows, strict=True):
+        np.testing.assert_allclose(view.reading_m, pose[:3, 3], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(view.joints_rad, world.joints[stop], rtol=0, atol=1e-9)
+
+
+def test_a_list_of_joints_stands_beside_each_point(tmp_path):
+    rows = [
+        dict(zip(("q", *"xyz"), (shop().joints[stop].tolist(), *pose[:3, 3]), strict=True))
+        for stop, _, pose in shop().rows
+    ]
+    (tmp_path / "run.json").write_text(json.dumps(rows))
+    said = ("--mount", "instrument", "--robot-model", "ur10e")
+    visioncal("convert", tmp_path / "run.json", tmp_path / "out", *said).good()
+    for view, (stop, _, pose) in zip(
+        Session.load(tmp_path / "out").views, shop().rows, strict=True
+    ):
+        np.testing.assert_allclose(view.reading_m, pose[:3, 3], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(view.joints_rad, shop().joints[stop], rtol=0, atol=1e-9)
+
+
+def test_arrays_by_columns_are_rows(tmp_path):
+    """No row of joints is as long as the columns are many, and three joints are no point."""
+    joints = np.random.default_rng(1).uniform(-1, 1, (3, 357))
+    savemat(tmp_path / "Q.mat", {"Q": joints})
+    np.testing.assert_array_equal(read_fields(tmp_path / "Q.mat").numbers["Q"], joints.T)
+    refused = visioncal("convert", tmp_path / "Q.mat", tmp_path / "out", "--mount", "instrument")
+    refused.refused("no columns of measured points are known", "it has Q (3)")
+
+
+def test_joints_in_a_workbook_are_named_beside_points_of_a_probe(tmp_path):
+    rows = [["X  [mm]", "Y  [mm]", "Z  [mm]", "U(95)  [mm]", *(f"Q{at} " for at in range(4))]]
+    for _, _, pose in shop(poses=True).rows:
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rows.append(reads([], 0.004, w, x, y, z)(0, 0, pose))
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/Leica.csv").write_text(joined(rows))
+    (tmp_path / "in/theta.xlsx").write_bytes(b"PK")
+    refused = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "instrument")
+    refused.refused("do not say where the arm stood, and theta.xlsx is a workbook", "as .csv")
 
 
 def test_missing_columns_are_named_with_the_next_step(tmp_path):

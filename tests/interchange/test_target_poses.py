@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -54,7 +55,7 @@ def listed(name, rows):
     return f"{name}: !!opencv-matrix\n{shape}   data: [ {cells} ]\n"
 
 
-def opencv_s_calibration(folder):
+def opencv_s_calibration(folder, names=("extrinsic_parameters",)):
     """Extrinsic parameters with the rotation first, beside one XML a pose of numbered values."""
     poses, seen, _ = world()
     for at, pose in enumerate(poses):
@@ -69,9 +70,25 @@ def opencv_s_calibration(folder):
         write(folder / f"poses/robot{at}.xml", f"{head}\n{text}\n</opencv_storage>\n")
     place, turn = halves(seen)
     lens = listed("camera_matrix", np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]]))
-    rows = listed("extrinsic_parameters", np.hstack([turn, place]))
+    halves_of = np.split(np.hstack([turn, place]), len(names), axis=1)
+    rows = "".join(map(listed, names, halves_of))
     size = "image_width: 640\nimage_height: 400\n"
     write(folder / "camera_data.yml", f"%YAML:1.0\n---\n{size}{lens}{rows}")
+
+
+def opencv_s_vectors(folder):
+    """Vectors of calibrateCamera by their own names, beside its matrix."""
+    opencv_s_calibration(folder, ("rotation_vectors", "translation_vectors"))
+
+
+def assigned_lists(folder):
+    """Lists of lists in lines of a text, each a rotation by rows and then a position."""
+    sides = zip(("UR_pose", "Camera_to_object"), world(), strict=False)
+    rows = (
+        (name, [[*pose[:3, :3].ravel().tolist(), *pose[:3, 3].tolist()] for pose in poses])
+        for name, poses in sides
+    )
+    write(folder / "run.txt", "\n".join(f"{name} = {each}" for name, each in rows))
 
 
 def counted_rows(folder):
@@ -151,10 +168,12 @@ def called_by_initials(folder):
 @pytest.mark.parametrize(
     "make",
     [
+        assigned_lists,
         called_by_an_equation,
         called_by_initials,
         copied,
         opencv_s_calibration,
+        opencv_s_vectors,
         counted_rows,
         vectors_by_name,
         in_turn_above_a_result,
@@ -170,6 +189,33 @@ def test_poses_of_the_target_come_in_as_programs_store_them(make, tmp_path):
     for view, pose, board in zip(found, poses, seen, strict=True):
         np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
         np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
+
+
+def test_vectors_of_a_calibration_without_a_robot_are_the_target_s(tmp_path):
+    opencv_s_vectors(tmp_path / "in")
+    shutil.rmtree(tmp_path / "in/poses")
+    refused = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    refused.refused("Which of these are the robot's poses is not known", "are the target's")
+
+
+def test_letters_below_a_heading_say_the_order_of_a_quaternion(tmp_path):
+    """Beside the camera's points, and a few rows of another run in a folder within."""
+    poses, seen, _ = world()
+    for folder, count in ((tmp_path / "in", 9), (tmp_path / "in/scripts", 4)):
+        lines = list[str]()
+        for pose in poses[:count]:
+            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+            rows = {"translation": (*"xyz",), "rotation": (*"wxyz",)}
+            values = (pose[:3, 3].tolist(), (w, x, y, z))
+            for (name, letters), each in zip(rows.items(), values, strict=True):
+                lines += [f"{name}:", *(f"{a}: {v!r}" for a, v in zip(letters, each, strict=True))]
+        write(folder / "frames.txt", "\n".join(lines))
+        points = (",".join(map(repr, row)) for row in seen[:count, :3, 3].tolist())
+        write(folder / "points.txt", "\n".join(points))
+    visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand").good()
+    views = Session.load(tmp_path / "out").views
+    found = np.array([view.base_from_flange().as_matrix() for view in views])
+    np.testing.assert_allclose(found, poses, atol=1e-9)
 
 
 def corners_px(seen):

@@ -24,6 +24,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
 from visioncal.interchange.formats.fields import (
     MOST_NUMBERS,
+    POSE_SIZES,
     appearance,
     separate,
 )
@@ -141,20 +142,26 @@ def _with_extrinsics(document: object) -> object:
     if not isinstance(document, Mapping) or "camera_matrix" not in document:
         return document
     called = {str(key).lower(): key for key in document}
-    key = called.get("extrinsic_parameters")
-    extrinsics = np.array([]) if key is None else np.asarray(document[key])
-    if extrinsics.ndim != 2 or extrinsics.shape[1] != 6:
-        return document
-    rest = {name: value for name, value in document.items() if name != key}
-    turns, places = np.split(extrinsics, 2, axis=1)
-    found = {"board_to_camera_rvecs": [*turns], "board_to_camera_tvecs": [*places]}
-    return {**rest, **{f"{key}.{name}": rows for name, rows in found.items()}}
+    halves = [called.get(f"{half}_vectors", "") for half in ("rotation", "translation")]
+    keys = halves if all(halves) else [called.get("extrinsic_parameters", "")]
+    with suppress(KeyError, ValueError, TypeError):
+        extrinsics = np.hstack([np.array(document[key], dtype=float) for key in keys])
+        rest = {name: value for name, value in document.items() if name not in keys}
+        turns, places = extrinsics.reshape(-1, 2, 3).swapaxes(0, 1)
+        found = {"board_to_camera_rvecs": [*turns], "board_to_camera_tvecs": [*places]}
+        return {**rest, **{f"extrinsic_parameters.{name}": rows for name, rows in found.items()}}
+    return document
 
 
 def _by_view(array: Array) -> Array:
-    """An array of n views whose first dimension is theirs, where its rotations show the last is."""
+    """An array of n views whose first dimension is theirs, where the last is.
+
+    Its rotations show that, or no row of a pose or of joints is as long.
+    """
     if array.dtype.kind == "S":
         return np.asarray(np.char.decode(array, "latin-1"))
+    if array.ndim == 2 and len(array) <= max(POSE_SIZES) < MOST_NUMBERS < array.shape[1]:
+        return array.T
     if array.ndim > 1 and array.dtype.kind in "fiu" and not appearance(array.astype(float)):
         turned = np.moveaxis(array, -1, 0)
         return turned if appearance(turned.astype(float)) else array
@@ -191,8 +198,8 @@ _INITIALISED = re.compile(r"\b(\w++)\s*+(?:\[\w*+\]\s*+)*+=?\s*+(\{[-+0-9.eE,\s{
 _FILLED = re.compile(
     r"\b(\w++)\s*+=\s*+\(?(?:cv::)?Mat_<\w++>\(\s*+([0-9]++)[\s,0-9]++\)\s*+<<([-+0-9.eE,\s]++)"
 )
-# A list that a Python program assigns to a name, over several lines.
-_ASSIGNED = re.compile(r"^\w+ *= *(?:\w+\.)?(?:as)?(?:array\()?\[ *(?:#.*)?$", re.MULTILINE)
+# A list that a Python program assigns to a name, over several lines or of lists.
+_ASSIGNED = re.compile(r"^\w+ *= *(?:\w+\.)?(?:as)?(?:array\()?\[ *(?:#.*|\[.*)?$", re.MULTILINE)
 
 
 def scripted_record(text: str, path: Path) -> dict[str, object]:

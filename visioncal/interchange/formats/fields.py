@@ -322,19 +322,18 @@ def split_matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
     last = np.array([0.0, 0, 0, 1])
     if flat.shape[1] == 12:
         matrices = flat.reshape(-1, 3, 4)
-        upper_rows = matrices[:, :, :3].reshape(-1, 9)
-        if _are_rotations(flat[:, 3:]).sum() > _are_rotations(upper_rows).sum():
-            return flat[:, :3].copy(), flat[:, 3:].copy()
-    else:
-        square = flat.reshape(-1, 4, 4)
-        by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
-        matrices = np.where(by_columns[:, None, None], np.swapaxes(square, 1, 2), square)
-        wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
-            np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
-        )
-        # A matrix with another last row is no rigid transform: its zeroed rotation is refused
-        # later.
-        matrices = np.where(wrong[:, None, None], 0.0, matrices)
+        by_rows = matrices[:, :, 3], matrices[:, :, :3].reshape(-1, 9)
+        ways = (by_rows, (flat[:, :3], flat[:, 3:]), (flat[:, 9:], flat[:, :9]))
+        places, turns = max(ways, key=lambda way: int(_are_rotations(way[1]).sum()))
+        return places.copy(), turns.copy()
+    square = flat.reshape(-1, 4, 4)
+    by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
+    matrices = np.where(by_columns[:, None, None], np.swapaxes(square, 1, 2), square)
+    wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
+        np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
+    )
+    # A matrix with another last row is no rigid transform: its zeroed rotation is refused later.
+    matrices = np.where(wrong[:, None, None], 0.0, matrices)
     return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
 
 

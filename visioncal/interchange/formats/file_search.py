@@ -38,6 +38,19 @@ DRAWN = re.compile(
 )
 
 
+# Files of numbers that are not read, and how to write them.
+_PICKLE = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
+_WORKBOOK = "a workbook: save its sheet with the poses as .csv"
+_SHUT = dict.fromkeys((".pkl", ".pickle", ".p"), _PICKLE) | dict.fromkeys(
+    (".xlsx", ".xls"), _WORKBOOK
+)
+
+
+def shut(label: str) -> str:
+    """A kind of files of numbers that is not read, and how to write them; empty of others."""
+    return next((_SHUT[end] for end in _SHUT if label.lower().endswith(end)), "")
+
+
 @dataclass(frozen=True)
 class ImageKind:
     """Content of an image file."""

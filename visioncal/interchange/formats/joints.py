@@ -23,7 +23,7 @@ _JOINT_NAME = re.compile(
 _JOINT_WORDS = re.compile(
     r"joint\w*angle|angle\w*joint|angle_?positions?|gelenkwinkel|achswinkel|关节|關節"
 )
-_OF_ARMS = range(5, 9)
+OF_ARMS = range(5, 9)
 # Three angles may be a rotation.
 _ANGLES = re.compile(r"(?:.*[._])?angles")
 # Universal Robots' names, which ROS writes in the order of the alphabet.
@@ -54,7 +54,7 @@ def joint_names(
         and name not in taken
         and (
             _JOINTS.fullmatch(plain[name])
-            or (numbers[0].size in _OF_ARMS and _is_of_joints(plain[name]))
+            or (numbers[0].size in OF_ARMS and _is_of_joints(plain[name]))
             or (numbers[0].size > 4 and _ANGLES.fullmatch(plain[name]))
         )
     ]

@@ -16,6 +16,7 @@ from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import POSE_SIZES, Fields, fields_of_records, separate
 
 # Robots' programs, of which the poses alone are read.
@@ -103,8 +104,11 @@ def _pictured(stop: _Lines) -> str:
     return next((match[0] for _, line in stop if (match := IMAGE.search(line))), "")
 
 
-def arrays_in(lines: _Lines) -> dict[str, list[float]]:
-    """The numbers of lines by name: their own, or that of the heading above, of two and more."""
+def arrays_in(lines: _Lines) -> dict[str, FloatArray]:
+    """The numbers of lines by name: their own, or that of the heading above, of two and more.
+
+    Numbers of one letter, as of a quaternion, keep it below their heading: `rotation.w`.
+    """
     arrays, heading = defaultdict[str, list[float]](list), "matrix"
     entries = [(*_numbers_in(line), line) for _, line in lines]
     above = list[str]()
@@ -115,18 +119,24 @@ def arrays_in(lines: _Lines) -> dict[str, list[float]]:
         above.append(heading)
     headed = {top for top, (name, row, _) in zip(above, entries, strict=True) if row}
     for top, (name, numbers, line) in zip(above, entries, strict=True):
-        is_headed = name == "matrix" or (name in _PARTS and len(numbers) == 1)
-        named = top if is_headed and len(headed - {"matrix"}) > 1 else name
+        is_part = name in _PARTS and len(numbers) == 1
+        is_headed = (name == "matrix" or is_part) and len(headed - {"matrix"}) > 1
+        named = (f"{top}.{name}" if is_part else top) if is_headed else name
         # A pose or a list that is written again replaces the first.
         is_whole = len(numbers) in POSE_SIZES or (named != "matrix" and "[" in line)
         is_again = is_whole and len(numbers) == len(arrays[named])
         arrays[named] = numbers if is_again else arrays[named] + numbers
-    return {name: row for name, row in arrays.items() if row}
+    parts = {f"{top}.{name}" for top in headed for name in _PARTS}
+    return {
+        name: np.array(row[0] if name in parts and len(row) == 1 else row)
+        for name, row in arrays.items()
+        if row
+    }
 
 
 def blocks_of(lines: _Lines, path: Path) -> Fields | None:
     """Rows of several lines each, of a picture or below a line of words; None where none are."""
-    rows = list[tuple[str, dict[str, object], dict[str, list[float]]]]()
+    rows = list[tuple[str, dict[str, object], dict[str, FloatArray]]]()
     for stop in _stops(closed(lines)):
         arrays = arrays_in(stop)
         title = next((line for _, line in reversed(stop) if not _numbers_in(line)[1]), "")
@@ -139,7 +149,7 @@ def blocks_of(lines: _Lines, path: Path) -> Fields | None:
     counts = Counter(name for *_, arrays in rows for name in arrays)
     usual = {name for name, count in counts.items() if 2 * count >= len(rows)}
     records = [
-        words | {name: np.array(row) for name, row in arrays.items() if name in usual}
+        words | {name: row for name, row in arrays.items() if name in usual}
         for _, words, arrays in rows
     ]
     fields = fields_of_records(records, [place for place, *_ in rows], path.stem, path.parent)

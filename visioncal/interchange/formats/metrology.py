@@ -23,7 +23,7 @@ from visioncal.core.number_format import counted, figure, known_name, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.assemble import pose_cells
 from visioncal.interchange.formats.fields import Fields
-from visioncal.interchange.formats.file_search import files_in, groups_in, head
+from visioncal.interchange.formats.file_search import files_in, groups_in, head, shut
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
@@ -95,8 +95,18 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     )
     states.sort(key=lambda t: points is None or len(t.fields) != len(points.fields))
     state = next((t for t in states if (t is points) != bool(points_only)), None)
-    if points is None or (state is points and points.poses and not points.is_measured):
-        listed = "; ".join(table.fields.listing() for table in tables)
+    is_state_alone = state is points and bool(points and points.poses and not points.is_measured)
+    unread = [(each.label, fault) for each in groups_in(path) if (fault := shut(each.label))]
+    if unread and (points is None or is_state_alone or state is None):
+        missing = "the measured points" if points is None else "where the arm stood"
+        raise DataError(
+            f"{path.name}: the tables that are read do not say {missing}, and {unread[0][0]} is "
+            f"{unread[0][1]}.",
+            culprits=[unread[0][0]],
+            next_step="Put that table beside the others, and convert the folder.",
+        )
+    if points is None or is_state_alone:
+        listed = "; ".join(dict.fromkeys(table.fields.listing() for table in tables))
         raise DataError(
             f"{path.name}: no columns of measured points are known, as X, Y, Z or Meas X [mm]; it "
             f"has {listed or 'no tables'}.",
@@ -229,7 +239,8 @@ def _stops(
     last = free[-1] if free and len({*free[-1]}) < count else ("",) * count
     names, spots = texts.get(points.named(_STOP), ()), last
     if held:
-        rows = [*zip(load, *(texts[name] for name in held), strict=True)]
+        cells = (map(str, points.fields.column(name).tolist()) for name in held)
+        rows = [*zip(load, *cells, strict=True)]
         changes = [row != before for row, before in zip(rows, [None, *rows], strict=False)]
         names = tuple(map(str, np.cumsum(changes)))
     elif len({*names}) < 2 and len(free) > 1 and any(last):

@@ -14,7 +14,7 @@ from visioncal.core.documents.tables import is_number
 from visioncal.interchange.formats.fields import Fields, is_headerless, unit_by_size
 from visioncal.interchange.formats.file_search import head
 from visioncal.interchange.formats.foreign import ImportOptions
-from visioncal.interchange.formats.joints import joint_names
+from visioncal.interchange.formats.joints import OF_ARMS, joint_names
 from visioncal.interchange.formats.poses import pose_names
 
 Words: TypeAlias = frozenset[str]
@@ -48,6 +48,8 @@ UNITS = {name: name for name in (*UNITS_M, "deg", "rad", "kg", "n")} | {
     }.items()
     for word in words.split()
 }
+# Names of files of joint angles without headings.
+_OF_JOINTS = re.compile("joint|angle|theta|achs|gelenk", re.IGNORECASE)
 _UNIT_LINE = re.compile(r"\b(?:units?|length|einheit(?:en)?)\b[\W_]*([^\W_]+)", re.IGNORECASE)
 
 
@@ -97,8 +99,8 @@ class PointTable:
         taken = taken or next(iter(table.points().values()), ())
         joints = tuple(name for name in requested.joints if name in field_names)
         joints = joints or joint_names(fields, taken)
-        if is_headerless(fields) and "joint" in fields.name.lower():
-            joints = joints or tuple(fields.numbers)
+        if is_headerless(fields) and len(fields.numbers) in OF_ARMS:
+            joints = joints or tuple(fields.numbers) * bool(_OF_JOINTS.search(fields.name))
         given = tuple(name for name in requested.robot.names if name in field_names)
         others = (*joints, *(taken if joints or table.is_measured else ()))
         poses = pose_names(fields, given, "robot", others, by_shape=False)
@@ -141,7 +143,8 @@ class PointTable:
 def _with_headings(fields: Fields) -> Fields:
     """Rows of names, x, y, z and uncertainties without headings, with these."""
     lists = [numbers for numbers in fields.numbers.values() if numbers.ndim == 2]
-    if len(fields.numbers) == 1 and lists and lists[0].shape[1] == 3:
+    is_array = len(fields.numbers) == 1 and lists and not joint_names(fields, ())
+    if is_array and lists[0].shape[1] == 3:
         # An array of a file of arrays, which keeps its name.
         axes = {axis: lists[0][:, at] for at, axis in enumerate("xyz")}
         return replace(fields, numbers={**fields.numbers, **axes})

@@ -278,7 +278,7 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
             table = read_table(path, text)
         except DataError:
             if arrays := arrays_in(closed(placed(text, path))):
-                return {name: np.array(row) for name, row in arrays.items()}
+                return {**arrays}
             raise
         rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
         document = rows[0] if len(rows) == 1 else rows

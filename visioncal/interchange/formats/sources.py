@@ -27,7 +27,7 @@ from visioncal.interchange.formats.fields import (
     joined,
     named_by,
 )
-from visioncal.interchange.formats.file_search import DRAWN, FileGroup, groups_in, head
+from visioncal.interchange.formats.file_search import DRAWN, FileGroup, groups_in, head, shut
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import (
     FAULT,
@@ -55,12 +55,6 @@ from visioncal.robot.files import read_robot_document
 _OF_BOARDS, _MOST_OF_BOARD = (".toml", ".yaml", ".yml", ".json"), 10_000
 # Files without poses that are listed one by one.
 _LISTED = 6
-# Files of numbers that are not read, and how to write them.
-_PICKLE = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
-_WORKBOOK = "a workbook: save its sheet with the poses as .csv"
-_SHUT = dict.fromkeys((".pkl", ".pickle", ".p"), _PICKLE) | dict.fromkeys(
-    (".xlsx", ".xls"), _WORKBOOK
-)
 # Lines of a camera_info's matrix and coefficients.
 _CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
 # Readings of one source that are tested, the rank of rows that are no recording beside others, and
@@ -230,7 +224,7 @@ def _array(fields: Fields) -> FloatArray | None:
 
 
 def _part(group: FileGroup, form: str | None) -> Part:
-    if fault := next((_SHUT[end] for end in _SHUT if group.label.lower().endswith(end)), ""):
+    if fault := shut(group.label):
         return Part(group, fault=DataError(f"{fault}.", culprits=[group.label]))
     if not group.is_data:
         return Part(group)
@@ -273,7 +267,8 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     is_seen = bool(source.images or requested.images)
     found: list[tuple[int, Fields, ImportOptions]] = []
     rows = rows_in(source)
-    of_robot = [len(fields) for fields in rows if _is_of_robot(fields)]
+    of_poses = [len(fields) for fields in rows if possible_poses(fields)]
+    of_robot = [len(fields) for fields in rows if _is_of_robot(fields)] or of_poses
     for fields in [each for each in rows if _has(each, given)] or rows:
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
