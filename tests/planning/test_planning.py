@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 from support.apart import clearances, corners
-from support.cells import exact, known_of
+from support.cells import calibrated, exact, known_of
 from support.live_cell import postures_in_view, true_cell
 from support.marks import slow
 from support.refusals import raised
@@ -16,14 +16,16 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import Camera, FloatArray, Need
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
+from visioncal.planning import pick_probability
 from visioncal.planning.candidates import candidates
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.design import Design, choose_stops
 from visioncal.planning.information import WORLDS, predict_worlds, stop_factors
 from visioncal.planning.path import Route, left_candidates, order_stops
+from visioncal.planning.pick_probability import Picking
 from visioncal.planning.purposes import PURPOSES, Purpose
 from visioncal.planning.recorded import SessionStart, start_from_session
 from visioncal.planning.visibility import FieldOfView
@@ -221,6 +223,31 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     assert mm(world, []) == pytest.approx(obtained, rel=0.02)
     assert design.before.mm == pytest.approx(obtained, rel=0.15)
     assert design.predicted.mm == pytest.approx(mm(world, design.rows), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("mount", "changes"),
+    [
+        ("eye-in-hand", {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}),
+        slow("eye-to-hand", {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}),
+        *(slow(mount, {"state_intrinsics": False}) for mount in MOUNTS),
+    ],
+)
+def test_picks_by_what_was_recorded_are_those_of_the_verdict(mount, changes, monkeypatch):
+    # A plan adds a margin to the noise, for sessions that show more by chance: here as much as half
+    # of them.
+    monkeypatch.setattr(pick_probability, "_LARGER_NOISE", 0.5)
+    cell = simulate(replace(CELL, mount=mount, views=15, seed=1, **changes))
+    begun, (picks,) = start_from_session(*so_far_of(cell)), calibrated(cell).findings.picks
+    q = cell.robot.joints
+    worlds = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded, estimates_lens=True)
+    by_controller = picks if picks.uncorrected is None else picks.uncorrected
+    for verdict, is_corrected in ((picks, True), (by_controller, False)):
+        # Both know the noise by what 15 stops show, and the arm by two levels of its errors.
+        need = Need(mm=0.5 * verdict.good_for_mm)
+        plan = Picking([begun.cell], worlds, q, need, begun.recorded)
+        chance = plan.chance(np.arange(0), is_corrected=is_corrected)
+        assert chance == pytest.approx(verdict.probability(need), abs=0.12)
 
 
 @pytest.mark.slow

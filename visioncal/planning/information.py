@@ -49,6 +49,9 @@ class RecordedStops:
     first_corner: int = 0  # Number of the first corner of the planned board.
     # Posture-dependent errors of the arm at the stops; None where the stops show none.
     arm: ArmErrors | None = None
+    # (a,) their values, in radians, where picks are by the controller's own poses; None for targets
+    # that are corrected, or errors that are not estimated.
+    arm_values: FloatArray | None = None
     # (12, c) root of the covariance of the edges' further errors, those of an arm without joint
     # angles. More stops do not reduce them.
     edge_error_root: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
@@ -103,10 +106,16 @@ class World:
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
         """Covariance (p, p) of the unknowns from some candidates and the recorded stops."""
+        size = len(self.prior)
+        return self.joint_covariance(rows)[:size, :size]
+
+    def joint_covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
+        """Covariance (p + a, p + a) of the unknowns and of what a fit does not estimate."""
         taken = self.factors[rows]
         fitted = covariance_from(self.prior + self.recorded + gram(taken, taken))
         bias = fitted @ (self.gradient + gram(taken, self.unestimated[rows]))
-        return np.asarray(fitted + bias @ bias.T)
+        # The fit deviates by its bias times the errors, and the truth from it the other way.
+        return np.block([[fitted + bias @ bias.T, -bias], [-bias.T, np.eye(bias.shape[1])]])
 
     def variances(self, covariance: FloatArray) -> tuple[float, float]:
         """Variances of the reported position [m^2] and rotation [rad^2] with a covariance."""
@@ -157,7 +166,7 @@ def stop_factors(
     free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
     lens = is_of_lens(free) & ~free.anchored & estimates_lens
     poses = cell.cam_from_target(q)
-    stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
+    stack, seen = predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
     count = len(free.columns)
     shared = count if recorded is None else len(recorded.shared)
     columns = 12 + shared + arm_size(cell.robot, purpose, recorded)
@@ -247,38 +256,6 @@ def stated(cell: PlanCell, *, estimates_lens: bool = False) -> LensBoardParamete
         np.diag(sigmas**-2.0),
         np.zeros(len(sigmas)),
     )
-
-
-def pick_jacobian(
-    cell: PlanCell, q: FloatArray, recorded: RecordedStops | None, size: int
-) -> FloatArray:
-    """Jacobian (k, 6, p) of things that the camera sees where stops see the board's middle.
-
-    Args:
-        cell: The cell.
-        q: (k, n) joint angles of the stops [rad].
-        recorded: Stops that were recorded already.
-        size: Number p of the unknowns.
-
-    Returns:
-        By the unknowns, of rotation [rad] and position [m], in the axes of what carries the camera:
-        the flange, or the base. The size of things is not that of the board.
-    """
-    poses, middle = cell.cam_from_target(q), corner_positions(cell.target).mean(axis=0)
-    free, jacobian = parameters_of(cell, recorded, estimates_lens=True), np.zeros((len(q), 6, size))
-    is_lens = is_of_lens(free)
-    stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
-    shown = np.zeros((len(q), 6, len(is_lens)))
-    if is_lens.any() and seen.any():
-        compressed = compress(stack, free.basis, free.appearance, poses[seen])
-        shown[seen] = compressed.by_shared[:, :, free.columns] * is_lens
-    flange = cell.robot.base_from_flange(q)
-    fit = Fit.of_stops(
-        cell.mount, (cell.x, cell.z), flange, cell.noise, effects=[free.effect(shown)]
-    )
-    located = fit.located(next(iter(fit.frames)), np.tile(middle, (len(q), 1)))
-    jacobian[:, :, : located.shape[2]] = located
-    return jacobian
 
 
 def _world(
@@ -432,7 +409,7 @@ def arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = No
     return int(recorded.arm.basis.shape[2])
 
 
-def _predicted_corners(
+def predicted_corners(
     cell: PlanCell, poses: FloatArray, first_corner: int
 ) -> tuple[CornerStack, Mask]:
     """Predicted corners at (k, 4, 4) poses, and the mask of poses that show the board."""

@@ -2,17 +2,18 @@
 
 A pick is that of the verdict (`calibration.stages.need`): the camera observes an object as a stop
 observes its target, and the robot goes there. Included are the errors of the camera's pose and the
-noise of the flange at the pick, and at the observation where the flange carries the camera, and
-those of a lens that the stops determine. The error of detecting the object is not. Of a board that
-differs from its stated size by more than noise shows, the pick may be off by more; the plan gives
-the share from which the need is not met.
+noise of the flange at the pick, and at the observation where the flange carries the camera, those
+of a lens that the stops determine, and those of an arm that recorded stops show, by which the
+controller's own poses miss where targets are not corrected. The error of detecting the object is
+not. Of a board that differs from its stated size by more than noise shows, the pick may be off by
+more; the plan gives the share from which the need is not met.
 
 A verdict judges by the noise that its own stops show. A plan counts as much as nine of ten sessions
 of so many stops show at most, so that these meet the need.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,23 +21,102 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
-from visioncal.core.prediction import at_points, through
+from visioncal.core.prediction import at_points, through, to_points
 from visioncal.core.quantiles import chi2_limit, root_of
 from visioncal.core.tolerance_probability import chance_within
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Need
+from visioncal.estimation.appearance import compress
+from visioncal.estimation.fit import Fit
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.information import (
     RecordedStops,
     World,
     is_of_lens,
     parameters_of,
-    pick_jacobian,
+    predicted_corners,
 )
+from visioncal.robot.errors import link_basis
 from visioncal.vision.targets import corner_positions
 
 # Share of sessions that show more noise than a plan counts.
 _LARGER_NOISE = 0.1
+
+
+def pick_jacobian(
+    cell: PlanCell, q: FloatArray, recorded: RecordedStops | None, world: World
+) -> FloatArray:
+    """Jacobian (k, 6, p + a) of picks of things that the camera sees where stops see the board.
+
+    Errors of the arm's links that recorded stops show act at the look, at the pick, and on the
+    edges, which take up what is the same at all stops: the whole chain counts (as in
+    `calibration.stages.need`), and else the camera's edge and lens alone.
+
+    Args:
+        cell: The cell.
+        q: (k, n) joint angles of the stops [rad].
+        recorded: Stops that were recorded already.
+        world: Information on the p unknowns, and a that a fit does not estimate.
+
+    Returns:
+        By the errors of `World.joint_covariance`, of rotation [rad] and position [m], in the axes
+        of what carries the camera: the flange, or the base. The size of things is not that of the
+        board.
+    """
+    poses, middle = cell.cam_from_target(q), corner_positions(cell.target).mean(axis=0)
+    free, size = parameters_of(cell, recorded, estimates_lens=True), len(world.prior)
+    arm, is_lens = None if recorded is None else recorded.arm, is_of_lens(free)
+    first_corner = 0 if recorded is None else recorded.first_corner
+    stack, seen = predicted_corners(cell, poses, first_corner)
+    shown = np.zeros((len(q), 6, len(is_lens)))
+    jacobian = np.zeros((len(q), 6, size + world.unestimated.shape[2]))
+    if is_lens.any() and seen.any():
+        compressed = compress(stack, free.basis, free.appearance, poses[seen])
+        shown[seen] = compressed.by_shared[:, :, free.columns] * is_lens
+    if arm is not None:
+        # A thing's place does not follow the shape of the board, whose middle does.
+        corners = free.basis[first_corner : first_corner + len(corner_positions(cell.target))]
+        of_boards = free.columns[~is_lens] - len(free.appearance.values) + corners.shape[2]
+        shown[:, 3:, ~is_lens] = -corners.mean(axis=0)[:, of_boards]
+    flange, count = cell.robot.base_from_flange(q), 12 + len(is_lens)
+    fit = Fit.of_stops(
+        cell.mount, (cell.x, cell.z), flange, cell.noise, effects=[free.effect(shown)]
+    )
+    turn = cell.x[:3, :3]
+    if arm is None:
+        slopes = fit.located(next(iter(fit.frames)), np.tile(middle, (len(q), 1)))
+    else:
+        basis, turn = arm.sigma * link_basis(cell.robot, q), turn @ poses[:, :3, :3]
+        errors = fit.with_arm(fit.robots[0], replace(arm, basis=basis)).slopes
+        slopes = turned(turn, to_points(middle) @ errors)
+        first = size - basis.shape[2] if arm.is_estimated else size
+        jacobian[:, :, first : first + basis.shape[2]] = slopes[:, :, count:]
+    jacobian[:, :, :count] = slopes[:, :, :count]
+    return jacobian
+
+
+def pick_misses(cell: PlanCell, q: FloatArray, recorded: RecordedStops | None) -> FloatArray | None:
+    """(k, 6) known errors of picks by the controller's own poses, in the axes of `pick_jacobian`.
+
+    One that carries its camera looks in the posture of one stop and picks in that of another. None
+    where targets are corrected, or no errors of the arm are estimated.
+    """
+    if recorded is None or recorded.arm_values is None:
+        return None
+    flange, middle = cell.robot.base_from_flange(q), corner_positions(cell.target).mean(axis=0)
+    carrying = flange if cell.mount == "eye-in-hand" else np.eye(4)
+    places = (carrying @ cell.x @ cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
+    twists = adjoint(flange) @ link_basis(cell.robot, q) @ recorded.arm_values
+    missed = (to_points(places) @ twists[:, :, None])[:, :, 0]
+    if cell.mount == "eye-to-hand":
+        return missed
+    missed = missed - np.roll(missed, 1, axis=0)
+    return turned(invert(flange)[:, :3, :3], missed[:, :, None])[:, :, 0]
+
+
+def turned(rotations: FloatArray, errors: FloatArray) -> FloatArray:
+    """Errors (k, 6, ...) of rotation and position along other axes, by (k, 3, 3) rotations."""
+    return np.concatenate([rotations @ errors[:, :3], rotations @ errors[:, 3:]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +130,16 @@ class Picking:
     recorded: RecordedStops | None = None  # Stops that were recorded already.
 
     @cached_property
-    def _sights(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    def _sights(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray | None], ...]:
         """Picks at some candidates in each cell, by the unknowns and by the robot's noise.
 
-        Each has an (m, 6, p) Jacobian, and (2, m, 6, 6) covariances by the levels of rotation and
-        position of this noise, at observation and pick.
+        Each has an (m, 6, p + a) Jacobian, (2, m, 6, 6) covariances by the levels of rotation and
+        position of this noise, at observation and pick, and (m, 6) known errors.
         """
         q = self.q[np.linspace(0, len(self.q) - 1, min(40, len(self.q))).astype(np.int64)]
         sights = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
-            size = len(world.prior)
-            jacobian = pick_jacobian(cell, q, self.recorded, size)
+            jacobian = pick_jacobian(cell, q, self.recorded, world)
             # In the axes of what carries the camera: the flange, or the base.
             levels = cell.noise.robots[0][:, None] ** 2 * np.repeat(np.eye(2), 3, axis=1)
             covariances = np.tile((levels[:, None] * np.eye(6))[:, None], (1, len(q), 1, 1))
@@ -68,7 +147,7 @@ class Picking:
                 middle = corner_positions(cell.target).mean(axis=0)
                 points = (cell.x @ cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
                 covariances += at_points(levels[:, None, :, None] * np.eye(6), points)
-            sights.append((jacobian, covariances))
+            sights.append((jacobian, covariances, pick_misses(cell, q, self.recorded)))
         return tuple(sights)
 
     @cached_property
@@ -98,6 +177,7 @@ class Picking:
         size_share: float | None = None,
         known: IntArray | None = None,
         is_exact: bool = False,
+        is_corrected: bool = False,
     ) -> float:
         """Probability that a pick lands within tolerance, calibrated from (m,) candidates.
 
@@ -107,6 +187,7 @@ class Picking:
                 by no more than such stops show by chance.
             known: Columns that would be known; None for none.
             is_exact: Whether the robot would have no noise at observation and pick.
+            is_corrected: Whether targets would be corrected for the calibrated arm.
         """
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
         shift_m = np.inf if self.need.mm is None else 1e-3 * self.need.mm
@@ -114,13 +195,14 @@ class Picking:
         # corners hides is estimated from few: these are twice the square of its relative precision,
         # by the Fisher information of its square.
         stops = len(rows) + (0 if self.recorded is None else self.recorded.stops)
-        share = (stops - 2) / max(stops, 1) * (stops / max(len(rows), 1))
-        by_level = share * self._known_levels[rows].sum(axis=0)
+        # Recorded stops add as much as candidates do.
+        each = self._known_levels[rows if len(rows) else slice(None)].mean(axis=0)
+        by_level = (stops - 2) * each
         freedom = np.maximum([6 * stops - 12, *by_level], 1.0)
         growth, *levels = chi2_limit(_LARGER_NOISE, freedom) / freedom
         chances = []
-        for (jacobian, noise), world in zip(self._sights, self.worlds, strict=True):
-            covariance = world.covariance(rows)
+        for (jacobian, noise, misses), world in zip(self._sights, self.worlds, strict=True):
+            covariance, offsets = world.joint_covariance(rows), None if is_corrected else misses
             by_size, held_variances = covariance[:, self._held], np.diag(covariance)[self._held]
             square = (
                 chi2_limit(_LARGER_NOISE, 1) * held_variances
@@ -136,7 +218,8 @@ class Picking:
             covariances = through(jacobian, covariance)
             if not is_exact:
                 covariances += np.einsum("l,lmij->mij", levels, noise)
-            chances.append(chance_within(covariances, turn_rad, shift_m, float(freedom[-1])))
+            last = float(freedom[-1])
+            chances.append(chance_within(covariances, turn_rad, shift_m, last, offsets))
         return float(np.mean(chances))
 
     @cached_property
@@ -180,6 +263,8 @@ class Picking:
                 self.chance(rows, known=self.boards)
             ),
             "a robot without noise at the pick": self.chance(rows, is_exact=True),
+            "a correction of each target for the calibrated arm (visioncal correct; corrected = "
+            "true in [need])": self.chance(rows, is_corrected=True),
         }
         words, best = max(by_words.items(), key=lambda item: item[1])
         if best < self.chance(rows) + 0.01:

@@ -119,7 +119,9 @@ def start_from_session(
     # With few stops, error sizes that noise alone explains are mostly chance.
     is_likely = arm.is_modelled and arm.errors is not None and arm.errors.is_likely
     errors = arm.errors if is_likely else None
-    recorded = RecordedStops(fit, edges, free, arm.joints_rad, first_corner, errors)
+    is_missed = errors is not None and errors.is_estimated and not run.session.corrects_targets
+    values = run.cell_fit.fit.values(("arm", arm.robot)) if is_missed else None
+    recorded = RecordedStops(fit, edges, free, arm.joints_rad, first_corner, errors, values)
     if run.assessment_or_none is not None:
         recorded = _with_errors(recorded, run.assessment.fit, has_joints=arm.is_modelled)
     return SessionStart(cell, recorded, refusal, tuple(run.used[at] for at in first.tolist()))
