@@ -62,11 +62,12 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
         # Each parameter costs one in log-likelihood (Akaike 1974).
         sigma = np.sqrt(expit(0.5 * gain - 1.0)) * sigmas[-1]
     else:
-        levels = [np.append(likelihood.white[0], at) for at in _SIZES]
-        gains = [
-            likelihood.white[1] - extended.most_likely(at, np.append(seen, False))[1]
-            for at in levels
-        ]
+        levels, gains = likelihood.white[0].ravel(), list[float]()
+        for size_rad in _SIZES:
+            # Beside larger errors of links there is less noise.
+            found, value = extended.most_likely(np.append(levels, size_rad), np.append(seen, False))
+            levels = found[:-1]
+            gains.append(likelihood.white[1] - value)
         shares = _SIZE_PRIOR * np.exp(np.minimum(gains, 0.5 * SIGNIFICANT))
         sigma = np.sqrt(shares @ _SIZES**2 / (1.0 - _SIZE_PRIOR.sum() + shares.sum()))
         gain = min(gain, SIGNIFICANT)

@@ -13,7 +13,7 @@ kernel's Fourier series. The first two orders have further sizes of their own: t
 gears, and one of second harmonics. All joints share s and l, which is sought on a grid.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,6 +35,9 @@ from visioncal.robot.errors import SIGNIFICANT, ArmErrors
 # Lengths tried [rad], longest first, and the highest harmonic in inverse lengths: three thousandths
 # of the variance lie beyond. Shorter ones are not tried after this many that are less likely.
 _LENGTHS_RAD, _CARRIED, _WORSE = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0, 2
+# Least twice gain by errors with all other sizes held: those that are just significant have half of
+# that or more.
+_SHOWN = 5.0
 # Harmonics of order 2 of each joint.
 _SECOND = "second"
 # Typical sizes of errors [rad], with a log-normal prior of a factor of e; that of a compliance is
@@ -102,10 +105,15 @@ def estimate_arm_sizes(
     """
     nominal = robot_likelihood(problem, state, noise)
     plain = _Blocks(nominal, problem.robots.index(robot), bases, torque_nm)
+    columns: Iterable[FloatArray] = ()
     if harmonics is not None:
         harmonics = harmonics.reshape(*harmonics.shape[:2], -1, most_orders(), 2)
+        first = (_Waves.of(harmonics, length) for length in _LENGTHS_RAD[: _WORSE + 1])
+        columns = (candidate.columns for candidate in first)
         second = harmonics[:, :, :, 0].reshape(len(harmonics), 6, -1)
         plain = replace(plain, bases={**bases, _SECOND: second})
+    if not plain.may_be_shown(columns):
+        return None
     best = found = plain.most_likely(plain.start())
     if harmonics is None:
         # Where all blocks together have no evidence, none has.
@@ -120,9 +128,7 @@ def estimate_arm_sizes(
         _, gain = plain.likelihood.model.likely_size(
             found, blocks.columns(HARMONICS), plain.robot_units
         )
-        # Least twice gain by functions with all other sizes held: those that are just significant
-        # have half of that or more.
-        if 2.0 * gain > 5.0:
+        if 2.0 * gain > _SHOWN:
             logs = np.append(best.logs[: len(found.logs)], np.log(_TYPICAL[HARMONICS]))
             tried = blocks.most_likely(logs)
         if tried is not None and tried.value < best.value:
@@ -207,6 +213,22 @@ class _Blocks:
     def columns(self, name: str) -> FloatArray:
         """(m, 6 w, p) Jacobian of the robot's units by a block's errors."""
         return np.asarray(self.likelihood.jacobian[self.robot_units][:, :, self.slice_of(name)])
+
+    def may_be_shown(self, more: Iterable[FloatArray]) -> bool:
+        """Whether errors of the blocks, or by more columns (s, 6, q), may be significant.
+
+        By the gain of each block alone, at the noise of the nominal arm. Where significant errors
+        were found, of 94 searches, it was ten times the limit for blocks, and three for functions.
+        """
+        nominal, gain = self.nominal, 0.0
+        levels = np.maximum(nominal.white[0].ravel(), LEAST_SIGMA)
+        at = nominal.model.at(np.log(levels), is_sloped=False)
+        for basis in (*self.bases.values(), *more):
+            moved = nominal.moved(self.robot, basis)
+            gain += 2.0 * nominal.model.likely_size(at, moved, self.robot_units)[1]
+            if gain > _SHOWN:
+                return True
+        return False
 
     def start(self) -> FloatArray:
         """Logarithms (2 r + g,): sizes that explain all residuals, beside little noise."""

@@ -103,6 +103,8 @@ class ArmModel:
     @cached_property
     def robot(self) -> Robot:
         """The arm with its errors, up to the frame of the reported poses."""
+        if np.array_equal(self.flange_from_reported, np.eye(4)):
+            return self.bare
         mounted = np.zeros((self.nominal.joint_count + 1, 6))
         mounted[-1] = log(self.flange_from_reported)
         return self.bare.corrected(mounted)
