@@ -21,6 +21,7 @@ from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.board_points import with_board_points
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import misreadings, with_open_chains
 from visioncal.calibration.suspects.pairs_alone import found_alone, is_open, pairs_alone
@@ -242,3 +243,11 @@ def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
             if stage.name == "joints":
                 state, are_located = with_open_chains(state), True
         return state
+
+
+def measured_run(session: Session, progress: Progress | None) -> RunState:
+    """The run up to the camera's poses, for any of the robot's; raises as `run_stages`."""
+    # The offset of a stream's clock is found by rotation angles, which no reading changes.
+    by_clock = {"robot", "clock"} if waits_for_clock(session) else set()
+    names = {"detect", "intrinsics", "pnp"} | by_clock
+    return run_stages(RunState(session, progress), [each for each in STAGES if each.name in names])

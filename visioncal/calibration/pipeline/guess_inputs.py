@@ -13,10 +13,13 @@ from visioncal.calibration.guess.search import in_one_turn, turns_alike
 from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.observed import CameraObservations
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import compose, robot_part
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Mount
+from visioncal.core.verdict import Finding
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
@@ -207,3 +210,9 @@ def both_sides(
     alike = alike_turning(base_from_flange, seen, mount)
     pairs = [(base_from_flange[view], pose) for view, pose in alike.items()]
     return np.array([*alike], dtype=int), np.array(pairs).reshape(-1, 2, 4, 4)
+
+
+def board_shown(fault: VisioncalError | None) -> Finding | None:
+    """The board that images show in place of the stated one, where that kept them from use."""
+    found = fault.finding if isinstance(fault, OtherBoardError) else None
+    return found if found is not None and found.kind == "other_board" else None

@@ -16,7 +16,7 @@ from visioncal.calibration.stages.cameras import exchanged_columns
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.corner_sizes import scaled_px
 from visioncal.calibration.stages.detect import is_scaled
-from visioncal.calibration.stages.other_board import LOOKED_AT_LAST, OtherBoardError, spread
+from visioncal.calibration.stages.other_board import OtherBoardError, spread
 from visioncal.calibration.stages.robots import pairs_of
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import DataError, VisioncalError
@@ -24,7 +24,7 @@ from visioncal.core.number_format import ranges
 from visioncal.core.types import Image, Progress
 from visioncal.session import MemoryImages, Session, View
 from visioncal.session.corners import CornerTable
-from visioncal.vision.boards.identify import identify
+from visioncal.vision.boards.identify import LOOKED_AT_LAST, identify
 from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn, grey_of
 
 # Note that is not followed by a mirroring: that would undo half of it.

@@ -14,8 +14,6 @@ import numpy as np
 
 from visioncal.calibration.stages.corner_numbers import usable_corners
 from visioncal.calibration.stages.other_board import (
-    LOOKED_AT,
-    LOOKED_AT_LAST,
     MADE_ALIKE,
     OtherBoardError,
     board_correction,
@@ -30,6 +28,7 @@ from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.boards import NotFound, kind_of
 from visioncal.vision.boards.checkerboard import Checkerboard
+from visioncal.vision.boards.identify import LOOKED_AT, LOOKED_AT_LAST
 from visioncal.vision.boards.imaging import decode_image, faint_jpeg
 from visioncal.vision.detection import ONE_OPENCV_THREAD, find_corners
 from visioncal.vision.targets import corner_positions

@@ -18,6 +18,7 @@ from visioncal.session.kinds import declared_targets
 from visioncal.vision.boards import NotFound, find_target, kind_of
 from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.identify import (
+    LOOKED_AT,
     Identity,
     describe,
     identify,
@@ -26,10 +27,6 @@ from visioncal.vision.boards.identify import (
 )
 from visioncal.vision.targets import board_words, corner_positions, extent_m, outline, target_names
 
-# Images that are searched for any board: at first, and where none shows the declared one.
-LOOKED_AT, LOOKED_AT_LAST = 3, 12
-# Least share of a board's corners in an image that identifies it.
-LEAST_CORNERS = 0.2
 # Command that writes a copy with the images as they should be, and calibrates it.
 MEND_IMAGES = f"visioncal convert SESSION FIXED --mend-images && {CALIBRATE_FIXED}"
 # Remedy where some images are turned or scaled.
@@ -83,7 +80,7 @@ def other_board(
         # A sound one may be covered in part: its paper ends there.
         rims = [rim for image in images if (rim := _has_rim(image, identity.board)) is not None]
         is_sure &= sum(rims) > len(rims) / 2
-    if not is_sure or identity.corners_seen < LEAST_CORNERS * identity.corners:
+    if not is_sure or not identity.is_shown:
         return None
     numbers = tuple(view.number for view, _ in looked)
     # Of many images, some may not show it.

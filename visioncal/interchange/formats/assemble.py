@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.calibration.stages.other_board import LEAST_CORNERS, LOOKED_AT
 from visioncal.core.conventions import POSE_FORMS, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
@@ -30,7 +29,7 @@ from visioncal.session.corners import CornerTable
 from visioncal.session.images import CLOUD_ENDINGS, ListedImages
 from visioncal.session.table import check_two_sides
 from visioncal.vision.boards import kind_of
-from visioncal.vision.boards.identify import identify, with_article
+from visioncal.vision.boards.identify import LOOKED_AT, identify, with_article
 from visioncal.vision.boards.imaging import image_size, looks_like_image, read_image
 from visioncal.vision.targets import target_name
 
@@ -288,7 +287,7 @@ def _seen_board(images: Sequence[Path]) -> tuple[str, str]:
             return "known", "Give"
         is_sure = not seen.is_single or len(seen.marker_ids) < 2
         is_sure &= seen.shown >= min(2, len(some))
-        if is_sure and seen.corners_seen >= LEAST_CORNERS * seen.corners:
+        if is_sure and seen.is_shown:
             return (
                 f"stated: {with_article(seen)}",
                 f"Measure the {kind_of(seen.board).side}, write it [mm] in place of 30, and give "

@@ -20,8 +20,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
     open_pairs,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.run import STAGES, run_stages
-from visioncal.calibration.stages.clocks import waits_for_clock
+from visioncal.calibration.run import measured_run
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
@@ -107,14 +106,6 @@ class DoubtfulRobot:
         """Tries every plausible reading of its poses; raises as `DoubtfulSession.guess`."""
         del progress
         return guess_from_camera_poses(self.run, self.numbers)
-
-
-def measured_run(session: Session, progress: Progress | None) -> RunState:
-    """The turn of the camera's poses, for any of the robot's; raises as `DoubtfulSession.guess`."""
-    # The offset of a stream's clock is found by rotation angles, which no reading changes.
-    by_clock = {"robot", "clock"} if waits_for_clock(session) else set()
-    names = {"detect", "intrinsics", "pnp"} | by_clock
-    return run_stages(RunState(session, progress), [each for each in STAGES if each.name in names])
 
 
 def applied_reading(

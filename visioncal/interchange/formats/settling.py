@@ -21,12 +21,13 @@ from visioncal.calibration.guess import (
     are_of_camera,
 )
 from visioncal.calibration.pipeline.guess_inputs import (
+    board_shown,
     chain_poses,
     guess_from_camera_poses,
     may_agree,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.other_board import OtherBoardError
+from visioncal.calibration.run import measured_run
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
@@ -41,7 +42,7 @@ from visioncal.interchange.formats.assemble import (
 )
 from visioncal.interchange.formats.foreign import ForeignRecording, Side, rows_of
 from visioncal.interchange.formats.pairing import UnpairedError
-from visioncal.interchange.formats.rereading import DoubtfulSession, applied_reading, measured_run
+from visioncal.interchange.formats.rereading import DoubtfulSession, applied_reading
 
 # Advice where the motion determines neither the calibration nor the form of the poses.
 _MOVE = (
@@ -366,9 +367,9 @@ def _untested(
 
     `fault` is what kept the images from being used. Else notes that nothing was tested.
     """
-    other = fault.finding if isinstance(fault, OtherBoardError) else None
+    other = board_shown(fault)
     needs_form = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
-    if other is not None and other.kind == "other_board":
+    if other is not None:
         raise DataError(
             other.words,
             culprits=["--target"],

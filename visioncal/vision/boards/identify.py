@@ -21,6 +21,10 @@ from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA, DetectedCorners
 from visioncal.vision.boards.layout import FAMILIES, Marker, decoded, holding, side_share
 from visioncal.vision.targets import board_words
 
+# Images that are searched for any board: at first, and where none shows the declared one.
+LOOKED_AT, LOOKED_AT_LAST = 3, 12
+# Least share of a board's corners in an image that identifies it.
+_LEAST_CORNERS = 0.2
 # Fewer markers are single ones.
 _LEAST_MARKERS = 4
 _MAY_HAVE_MORE = "On some side no image shows where it ends: it may have more columns or rows."
@@ -47,6 +51,11 @@ class Identity:
     def is_single(self) -> bool:
         """Whether the target is a single marker."""
         return self.board.columns * self.board.rows == 1
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether an image shows enough of its corners to identify it."""
+        return self.corners_seen >= _LEAST_CORNERS * self.corners
 
     def target(self, name: str, square_m: float) -> Target:
         """The target, with the measured side of a square, or of a marker or a tag [m]."""
