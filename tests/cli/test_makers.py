@@ -24,6 +24,9 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.documents.pendants import pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
+from visioncal.interchange.formats.foreign import ImportOptions
+from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.touches import read_touches
 from visioncal.present.recording.notes import verdict_markdown
 from visioncal.results import Calibration, RobotResult, to_document
 from visioncal.robot import load_robot
@@ -144,6 +147,22 @@ def test_lines_of_a_pendant_are_read_by_the_names_or_as_stated(cell, maker, tmp_
     assert np.abs(np.array(poses_of(session)) - poses_of(cell)).max() < 1e-8
     other = visioncal("convert", source, tmp_path / "no", *words, "--robot-form", "fanuc")
     other.refused("not of 'fanuc'")
+
+
+@pytest.mark.parametrize("unit", ["", " rad"])
+def test_lines_in_degrees_by_their_names_may_be_in_radians(cell, unit, tmp_path):
+    """A log of a program with KUKA's names; in degrees the flange would hardly turn."""
+    lines = []
+    for at, pose in enumerate(poses_of(cell)):
+        x, y, z, *angles = written("kuka", pose)
+        cells = zip("ABC", np.deg2rad(angles), strict=True)
+        turns = " ".join(f"{name}:{value:.9f}{unit}" for name, value in cells)
+        lines.append(f"[{at + 1}] point x:{x:.9f} y:{y:.9f} z:{z:.9f} {turns}")
+    (tmp_path / "log.txt").write_text("\n".join(lines))
+    rows = read_touches(tmp_path / "log.txt", ImportOptions())
+    assert np.abs(rows.base_from_flange - poses_of(cell)).max() < 1e-8
+    notes = " ".join(read_fields(tmp_path / "log.txt").notes)
+    assert ("they are taken for radians" in notes) == (not unit)
 
 
 def test_names_of_columns_say_whose_poses_they_are_once_their_turns_are_found(cell, tmp_path):

@@ -399,10 +399,10 @@ def test_a_board_that_is_never_seen_is_no_other_one_of_the_session():
     assert {view % 2 for view in detect(session).corners} == {0}
 
 
-def cut_checkerboards(shifts):
+def cut_checkerboards(shifts, rim=60):
     """Pictures of 960 x 640 of 9 x 6 inner corners with squares of 84 px, which edges cut."""
     squares = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((84, 84))) * 200 + 20
-    print_ = np.pad(squares, 60, constant_values=220).astype(np.uint8)
+    print_ = np.pad(squares, rim, constant_values=220).astype(np.uint8)
     rng = np.random.default_rng(4)
     images = []
     for right, down, tilt in shifts:
@@ -428,6 +428,18 @@ def test_a_checkerboard_whose_end_is_not_shown_may_have_more():
     identity = identify(part)
     assert identity.shown == 0
     assert "may have more columns or rows" in identity.notes[0]
+
+
+def test_a_smaller_board_with_a_narrow_rim_is_no_part_of_the_stated_one(monkeypatch):
+    """The paper ends a third of a square beyond the squares, on a dark table."""
+    searched = []
+    monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_, **__: searched.append(1))
+    shifts = [(20.0, 10.0, 1e-4), (30.0, 15.0, 2e-4), (10.0, 20.0, 1.5e-4)]
+    images = cut_checkerboards(4 * shifts, rim=27)
+    target = Target("board", "checkerboard", 12, 8, 0.03, 3e-5)
+    with pytest.raises(OtherBoardError, match="checkerboard of 9 x 6"):
+        detect(Session.from_arrays(images, np.tile(np.eye(4), (12, 1, 1)), target))
+    assert not searched
 
 
 @pytest.mark.parametrize("stated", [(9, 7), (10, 7), slow((8, 5))])

@@ -16,7 +16,7 @@ from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.session.kinds import declared_targets
 from visioncal.vision.boards import NotFound, find_target, kind_of
-from visioncal.vision.boards.checkerboard import Checkerboard
+from visioncal.vision.boards.checkerboard import RIM, Checkerboard
 from visioncal.vision.boards.identify import (
     LOOKED_AT,
     Identity,
@@ -174,9 +174,8 @@ def _has_rim(image: Image, board: Target) -> bool | None:
         return False
     low, high = extent_m(board)
     along = np.linspace(0.0, 1.0, 40)[:, None]
-    # Of sides of 1 m; the next circles' centres are a distance from the outermost ones. Paper that
-    # is looked for beyond a checkerboard [squares].
-    rim = 1.0 - board.diameter_m / 2 if board.kind == "circles" else 0.35
+    # Of sides of 1 m; the next circles' centres are a distance from the outermost ones.
+    rim = 1.0 - board.diameter_m / 2 if board.kind == "circles" else RIM
     ends = outline(board)[:, :2] + rim * np.sign(outline(board)[:, :2] - (low + high) / 2)
     sides = [a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)]
     # Middles of squares; circles are seen between them too.

@@ -113,13 +113,14 @@ def line_numbers(line: str) -> tuple[float, ...]:
     return _values(words) or ()
 
 
-def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
+def read_pose(line: str, where: str, form: str | None = None, *, angle: str = "") -> PendantPose:
     """Reads a pose from a line.
 
     Args:
         line: The line.
         where: Its origin, for messages.
         form: A name among `POSE_FORMS` if the user states it; the line must agree.
+        angle: The unit of angles where the line states none, `rad` or `deg`; else that of the form.
 
     Raises:
         DataError: It is no pose, may be in several forms, or has implausible values.
@@ -142,18 +143,19 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
         )
     chosen = POSE_FORMS[_form(written, form, where)]
     rotation = chosen.rotation
-    if written.angle == "deg" and rotation == "rotation-vector":
+    angle = written.angle or angle
+    if angle == "deg" and rotation == "rotation-vector":
         rotation = "rotation-vector-deg"
-    if written.angle and rotation.startswith("euler"):
-        rotation = rotation[:-3] + written.angle
+    if angle and rotation.startswith("euler"):
+        rotation = rotation[:-3] + angle
     reading = Reading(rotation, written.length or chosen.unit)
     numbers = np.array(written.numbers)
     poses = PoseNumbers(numbers[None, :3], numbers[None, 3:], reading, (where,)).poses()
-    distance_m, angle = UNITS_M[reading.unit] * np.abs(numbers[:3]).max(), np.abs(numbers[3:]).max()
+    distance_m, most = UNITS_M[reading.unit] * np.abs(numbers[:3]).max(), np.abs(numbers[3:]).max()
     is_radian = rotation == "rotation-vector" or rotation.endswith("-rad")
-    if distance_m > _FAR_M or (is_radian and angle > _TURNED_RAD):
+    if distance_m > _FAR_M or (is_radian and most > _TURNED_RAD):
         what = f"it is {distance_m:.4g} m from the base"
-        what = what if distance_m > _FAR_M else f"an angle of {angle:.4g} is too large for radians"
+        what = what if distance_m > _FAR_M else f"an angle of {most:.4g} is too large for radians"
         raise DataError(
             f"{where}: read in {reading.words}, {what}.",
             culprits=[where],

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from visioncal.core.conventions import write_pose
-from visioncal.core.documents.pendants import is_marked_pose, read_pose
+from visioncal.core.documents.pendants import PendantPose, is_marked_pose, read_pose
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_VIEWS
@@ -277,9 +277,10 @@ def pendant_poses(text: str, path: Path, form: str | None) -> Fields | None:
     points = [match[1].split()[-1] + "]" * ("[" in match[1]) if match else "" for match in matches]
     is_named = len({*points}) == len(points)
     records, places, forms = [], list[str](), dict[str, str]()
-    for (place, line), point in zip(lines, points, strict=True):
+    poses, notes = _poses_of(lines, form)
+    for (place, line), point, pose in zip(lines, points, poses, strict=True):
         places.append(f"{place} ({point})" if is_named else place)
-        pose, image = read_pose(IMAGE.sub(" ", line), place, form), IMAGE.search(line)
+        image = IMAGE.search(line)
         forms.setdefault(pose.form.name, place)
         numbers = write_pose(pose.pose, pose.form)
         record = dict(zip(_NAMES[len(numbers)], numbers, strict=True))
@@ -291,4 +292,23 @@ def pendant_poses(text: str, path: Path, form: str | None) -> Fields | None:
             next_step="Put the poses of one robot into a file of their own.",
         )
     fields = fields_of_records(records, places, path.stem, path.parent)
-    return replace(fields, stems=tuple(points) if is_named else (), form=next(iter(forms)))
+    stems = tuple(points) if is_named else ()
+    return replace(fields, stems=stems, form=next(iter(forms)), notes=notes)
+
+
+def _poses_of(lines: _Lines, form: str | None) -> tuple[list[PendantPose], tuple[str, ...]]:
+    """The poses of lines in a maker's notation, and a note where their angles are in radians.
+
+    Degrees of all poses within pi would leave each flange upright, and turn it by a few degrees.
+    """
+    written = [(IMAGE.sub(" ", line), place) for place, line in lines]
+    poses = [read_pose(line, place, form) for line, place in written]
+    in_degrees = all(pose.reading.rotation.startswith("euler") for pose in poses)
+    angles = np.array([write_pose(pose.pose, pose.form)[3:] for pose in poses if in_degrees])
+    if len(angles) < FEWEST_VIEWS or not 1.0 < np.abs(angles).max() < 1.001 * np.pi:
+        return poses, ()
+    turned = [read_pose(line, place, form, angle="rad") for line, place in written]
+    # A unit that is written remains.
+    is_same = turned[0].reading == poses[0].reading
+    note = f"No angle is over {np.abs(angles).max():.4g}: they are taken for radians."
+    return turned, () if is_same else (note,)

@@ -1,5 +1,6 @@
 """Files that belong to rows of a table: by names, numbers, times or order."""
 
+import filecmp
 import re
 import shlex
 from collections.abc import Collection, Iterator, Sequence
@@ -162,7 +163,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     if not ranked:
         raise _unpaired(fields, max(groups, key=lambda group: len(group.files)))
     rivals = [group for group, _ in ranked if rank((group, _)) == rank(ranked[0])]
-    if len(rivals) > 1:
+    if not all(_are_copies(rivals[0], group) for group in rivals[1:]):
         raise DataError(
             f"Each row has several images: {some_of([group.listed() for group in rivals])}.",
             culprits=[group.label for group in rivals],
@@ -246,6 +247,13 @@ def _one_over(fields: Fields, group: FileGroup) -> Iterator[Match]:
     for left in range(max(rows, files)):
         every = np.delete(np.arange(max(rows, files)), left)
         yield Match(HOW[3], every if files > rows else np.insert(np.arange(files), left, -1))
+
+
+def _are_copies(one: FileGroup, other: FileGroup) -> bool:
+    """Whether two groups have the same pictures, byte by byte, as in a folder that was copied."""
+    is_equal = len(one.files) == len(other.files)
+    pairs = zip(one.files, other.files, strict=False)
+    return is_equal and all(filecmp.cmp(*pair, shallow=False) for pair in pairs)
 
 
 def _unpaired(fields: Fields, group: FileGroup) -> UnpairedError:

@@ -230,7 +230,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
         return declared
     moves = None if is_program else script_poses(text, path)
     if lines := moves or pendant_poses(text, path, form if form in POSE_FORMS else None):
-        return [replace(lines, notes=tool_note(text, path))]
+        return [replace(lines, notes=(*lines.notes, *tool_note(text, path)))]
     return [_of_lines(text, path)]
 
 

@@ -33,7 +33,7 @@ _FEWEST = ((4, 4), (3, 3))
 # from which on it is not plain: light and noise leave a tenth. The part that is averaged.
 _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
 # Distance from the outermost squares at which it shows whether others follow [squares].
-_RIM = 0.3
+RIM = 0.3
 # Share of a square around a corner within which edges refine it, and until when: by 0.01 px.
 _AROUND, _UNTIL = 0.25, (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
 # About the longer side of the image in which outlines of squares are looked for: among the noise of
@@ -153,7 +153,7 @@ class Checkerboard(Board):
         seen = self.search(image, target, quick=True)
         if isinstance(seen, NotFound):
             return image
-        grid = _extended(seen.px.reshape(target.rows, target.columns, 2), 1.0 + _RIM)
+        grid = _extended(seen.px.reshape(target.rows, target.columns, 2), 1.0 + RIM)
         hull = cv2.convexHull(grid.reshape(-1, 2).astype(np.float32)).astype(np.int32)
         return np.asarray(cv2.fillConvexPoly(image.copy(), hull, int(np.median(image))))
 
@@ -268,7 +268,7 @@ def _ends(image: Image, grid: FloatArray) -> bool | None:
         # By three rows, as perspective and lens change the steps from row to row.
         last, beyond = (
             first + by * (first - second) + by * (by + 1) / 2 * (first - 2 * second + third)
-            for by in (0.5, 1.0 + _RIM)
+            for by in (0.5, 1.0 + RIM)
         )
         middles = np.stack([last[1:] + last[:-1], beyond[1:] + beyond[:-1]]) / 2
         inside = (middles >= 0) & (middles <= limits)
