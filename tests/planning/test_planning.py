@@ -11,19 +11,29 @@ from support.cells import calibrated, exact, known_of
 from support.live_cell import postures_in_view, true_cell
 from support.marks import slow
 from support.refusals import raised
+from support.slopes import jacobian
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, FloatArray, Need
+from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.planning import pick_probability
 from visioncal.planning.candidates import candidates
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.design import Design, choose_stops
-from visioncal.planning.information import WORLDS, predict_worlds, stop_factors
+from visioncal.planning.information import (
+    WORLDS,
+    located_jacobian,
+    predict_worlds,
+    predicted_corners,
+    shown_fit,
+    stated,
+    stop_factors,
+)
 from visioncal.planning.path import Route, left_candidates, order_stops
 from visioncal.planning.pick_probability import Picking
 from visioncal.planning.purposes import PURPOSES, Purpose
@@ -34,7 +44,8 @@ from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import arm_named, forward
 from visioncal.simulation.boards import Sheet, centre_m, outline_m
 from visioncal.simulation.optics import sees
-from visioncal.vision.camera import project
+from visioncal.vision.camera import intrinsics, project, with_intrinsics
+from visioncal.vision.targets import corner_positions
 
 
 def plan_cell(options: CellOptions, sigma_rad: float = 0.0, sigma_m: float = 0.0) -> PlanCell:
@@ -123,6 +134,32 @@ def test_a_lens_is_predicted_as_well_as_the_corners_of_such_stops_show_it():
     assert predicted * np.outer(units, units) == pytest.approx(
         shown * np.outer(units, units), abs=1e-4
     )
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_things_are_off_by_the_camera_and_by_the_lens_as_their_images_say(mount, in_view):
+    cell, q = true_cell(replace(CELL, mount=mount)), in_view[:3]
+    if mount == "eye-to-hand":
+        q = simulate(replace(CELL, mount=mount, views=3)).robot.joints
+    free, middle = stated(cell, estimates_lens=True), corner_positions(cell.target).mean(axis=0)
+    poses, lens = cell.cam_from_target(q), intrinsics(cell.camera)
+    # A small board hardly shows k2 and k3.
+    units = np.append(np.full(4, lens[0]), [1.0, 1e2, 1.0, 1.0, 1e3])
+    stack, seen = predicted_corners(cell, poses, 0)
+    found = located_jacobian(shown_fit(cell, q, None, free), middle)[:, 3:]
+
+    def places(by: FloatArray) -> FloatArray:
+        """Where boards are by the same images, with an edge and a lens that are off."""
+        camera = with_intrinsics(cell.camera, lens + units * by[6:])
+        look = Appearance(camera, free.appearance.board)
+        shown = compress(stack, free.basis, look, poses[seen]).cam_from_target
+        return ((cell.x @ exp(by[:6])) @ shown @ [*middle, 1.0])[:, :3].ravel()
+
+    by_steps = jacobian(places, 6 + len(lens), 1e-4).reshape(len(q), 3, -1)
+    sizes = np.abs(by_steps).max(axis=(0, 1))
+    slopes = np.concatenate([found[:, :, :6], units * found[:, :, 12 : 12 + len(lens)]], axis=2)
+    # Poses fit their corners, and shift in proportion to the steps, to a thousandth.
+    np.testing.assert_allclose(slopes / sizes, by_steps / sizes, atol=1e-3)
 
 
 def test_the_choice_is_nearly_the_best_of_all():

@@ -12,7 +12,6 @@ from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
 from visioncal.core.linalg import covariance_from, gram
-from visioncal.core.prediction import to_points
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
@@ -258,6 +257,38 @@ def stated(cell: PlanCell, *, estimates_lens: bool = False) -> LensBoardParamete
     )
 
 
+def shown_fit(
+    cell: PlanCell,
+    q: FloatArray,
+    recorded: RecordedStops | None,
+    free: LensBoardParameters,
+    by_boards: FloatArray | None = None,
+) -> Fit:
+    """Stops (k, n) [rad] at which things are seen whose size is not that of the board.
+
+    `by_boards` is the (3, b) Jacobian of their places by the free shapes of boards [m]; the boards'
+    are none where None.
+    """
+    poses, is_lens = cell.cam_from_target(q), is_of_lens(free)
+    stack, seen = predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
+    shown = np.zeros((len(q), 6, len(is_lens)))
+    if is_lens.any() and seen.any():
+        compressed = compress(stack, free.basis, free.appearance, poses[seen])
+        shown[seen] = compressed.by_shared[:, :, free.columns] * is_lens
+    if by_boards is not None:
+        shown[:, 3:, ~is_lens] = -by_boards
+    flange, edges = cell.robot.base_from_flange(q), (cell.x, cell.z)
+    return Fit.of_stops(cell.mount, edges, flange, cell.noise, effects=[free.effect(shown)])
+
+
+def located_jacobian(fit: Fit, middle: FloatArray) -> FloatArray:
+    """Jacobian (k, 6, p) of things seen where stops see a point (3,) of the board [m].
+
+    By the unknowns of `shown_fit`, in the frame that carries the camera.
+    """
+    return fit.located(next(iter(fit.frames)), np.tile(middle, (len(fit.seen), 1)))
+
+
 def _world(
     cell: PlanCell,
     purpose: Purpose,
@@ -269,8 +300,7 @@ def _world(
     free = parameters_of(cell, recorded, estimates_lens=estimates_lens)
     shared = free.information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded, estimates_lens=estimates_lens)
-    shared_count, sigma = len(shared), arm_sigma(purpose)
-    arm = arm_size(cell.robot, purpose, recorded)
+    sigma, arm = arm_sigma(purpose), arm_size(cell.robot, purpose, recorded)
     if recorded is not None and not purpose.blocks and recorded.arm is not None:
         # Errors that a fit treats as noise are not unknowns.
         arm *= recorded.arm.is_estimated
@@ -282,22 +312,20 @@ def _world(
         recorded_information = _recorded_information(cell, purpose, recorded)
     middle = corner_positions(cell.target).mean(axis=0)
     if purpose.judged == "sight":
-        # Half the camera's position, half the points that it observes. An observed point is off by
-        # the error of the offset and by that of the rotation times the point's distance, at any
-        # posture of the arm.
-        observed = cell.cam_from_target(q) @ [*middle, 1.0]
-        position, rotation, point = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
+        # Half the camera's position, half the things that it observes, which are off by errors of
+        # the offset, of the rotation times their distance, and of the lens.
+        position, rotation, point = (np.zeros((len(q), 3, size)) for _ in range(3))
         position[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
-        point[:, :, :6] = to_points(observed[:, :3])[:, 3:]
+        located = located_jacobian(shown_fit(cell, q, recorded, free), middle)
+        point[:, :, : located.shape[2]] = located[:, 3:]
     else:
-        position, rotation = workspace_jacobian(cell, purpose, middle)
+        # Zeros for lens and board follow the edges.
+        at = np.full(len(shared), 12)
+        position, rotation = (
+            np.insert(part, at, 0.0, axis=2) for part in workspace_jacobian(cell, purpose, middle)
+        )
         point = position
-    # Zeros for lens and board follow the edges.
-    at = np.full(shared_count, 12)
-    place, turn, spot = (
-        np.insert(np.insert(mean_square(part), at, 0.0, axis=0), at, 0.0, axis=1)
-        for part in (position, rotation, point)
-    )
+    place, turn, spot = (mean_square(part) for part in (position, rotation, point))
     misfit, gradient = factors[:, :, size:], recorded_information[:size, size:]
     if recorded is not None and not purpose.blocks:
         error_root, held = recorded.edge_error_root, recorded.held.shape[1]

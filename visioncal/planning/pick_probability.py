@@ -26,15 +26,14 @@ from visioncal.core.quantiles import chi2_limit, root_of
 from visioncal.core.tolerance_probability import chance_within
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Need
-from visioncal.estimation.appearance import compress
-from visioncal.estimation.fit import Fit
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.information import (
     RecordedStops,
     World,
     is_of_lens,
+    located_jacobian,
     parameters_of,
-    predicted_corners,
+    shown_fit,
 )
 from visioncal.robot.errors import link_basis
 from visioncal.vision.targets import corner_positions
@@ -63,32 +62,22 @@ def pick_jacobian(
         of what carries the camera: the flange, or the base. The size of things is not that of the
         board.
     """
-    poses, middle = cell.cam_from_target(q), corner_positions(cell.target).mean(axis=0)
     free, size = parameters_of(cell, recorded, estimates_lens=True), len(world.prior)
-    arm, is_lens = None if recorded is None else recorded.arm, is_of_lens(free)
-    first_corner = 0 if recorded is None else recorded.first_corner
-    stack, seen = predicted_corners(cell, poses, first_corner)
-    shown = np.zeros((len(q), 6, len(is_lens)))
     jacobian = np.zeros((len(q), 6, size + world.unestimated.shape[2]))
-    if is_lens.any() and seen.any():
-        compressed = compress(stack, free.basis, free.appearance, poses[seen])
-        shown[seen] = compressed.by_shared[:, :, free.columns] * is_lens
-    if arm is not None:
-        # A thing's place does not follow the shape of the board, whose middle does.
-        corners = free.basis[first_corner : first_corner + len(corner_positions(cell.target))]
-        of_boards = free.columns[~is_lens] - len(free.appearance.values) + corners.shape[2]
-        shown[:, 3:, ~is_lens] = -corners.mean(axis=0)[:, of_boards]
-    flange, count = cell.robot.base_from_flange(q), 12 + len(is_lens)
-    fit = Fit.of_stops(
-        cell.mount, (cell.x, cell.z), flange, cell.noise, effects=[free.effect(shown)]
-    )
-    turn = cell.x[:3, :3]
-    if arm is None:
-        slopes = fit.located(next(iter(fit.frames)), np.tile(middle, (len(q), 1)))
+    places, count, turn = corner_positions(cell.target), 12 + len(free.columns), cell.x[:3, :3]
+    middle = places.mean(axis=0)
+    if recorded is None or recorded.arm is None:
+        slopes = located_jacobian(shown_fit(cell, q, recorded, free), middle)
     else:
-        basis, turn = arm.sigma * link_basis(cell.robot, q), turn @ poses[:, :3, :3]
-        errors = fit.with_arm(fit.robots[0], replace(arm, basis=basis)).slopes
-        slopes = turned(turn, to_points(middle) @ errors)
+        arm, of_boards = recorded.arm, free.columns[~is_of_lens(free)]
+        # A thing's place does not follow the shape of the board, whose middle does.
+        by_shape = free.basis[recorded.first_corner :][: len(places)].mean(axis=0)
+        by_boards = by_shape[:, of_boards - len(free.appearance.values) + by_shape.shape[1]]
+        basis = arm.sigma * link_basis(cell.robot, q)
+        fit = shown_fit(cell, q, recorded, free, by_boards)
+        fit = fit.with_arm(fit.robots[0], replace(arm, basis=basis))
+        turn = turn @ cell.cam_from_target(q)[:, :3, :3]
+        slopes = turned(turn, to_points(middle) @ fit.slopes)
         first = size - basis.shape[2] if arm.is_estimated else size
         jacobian[:, :, first : first + basis.shape[2]] = slopes[:, :, count:]
     jacobian[:, :, :count] = slopes[:, :, :count]
