@@ -1,7 +1,9 @@
 """Normal equations of a problem: whitening, and elimination of the flanges' errors."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -108,7 +110,8 @@ class Whitening:
             order = np.argsort(self.units[rows], kind="stable")
             units, first = np.unique(self.units[rows[order]], return_index=True)
             taken = np.add.reduceat(self.taken[rows[order]] @ augmented[order], first)
-            shared[np.ix_(units, np.arange(width), columns)] += taken
+            for place, part in _runs(columns):
+                shared[units, :, place] += taken[:, :, part]
         total -= gram(shared, shared)
         prior = problem.prior_information(state)
         return (
@@ -158,8 +161,9 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
         by_errors = linear.by_errors[rows[order]]
         turned = np.swapaxes(by_errors, 1, 2)
         unit_information[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
-        entries = np.ix_(units, np.arange(width), columns)
-        cross[entries] += np.add.reduceat(turned @ weighted[order], first)
+        crossed = np.add.reduceat(turned @ weighted[order], first)
+        for place, part in _runs(columns):
+            cross[units, :, place] += crossed[:, :, part]
     multiple = np.setdiff1d(np.arange(len(members)), unit_of[is_single])
     inverse[multiple], null_variance[multiple] = _pseudo_inverse(unit_information[multiple])
     solved[multiple] = inverse[multiple] @ cross[multiple]
@@ -176,6 +180,17 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
         inverse + null_variance,
         by_flanges,
     )
+
+
+def _runs(columns: IntArray) -> Iterator[tuple[slice, slice]]:
+    """Runs of successive columns, and their places among the columns.
+
+    Whole runs are added in a third of the time of single columns.
+    """
+    starts = [0, *(np.flatnonzero(np.diff(columns) != 1) + 1).tolist(), len(columns)]
+    for start, end in pairwise(starts):
+        first = int(columns[start])
+        yield slice(first, first + end - start), slice(start, end)
 
 
 def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
