@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import errno
 import gzip
 import io
 import json
@@ -693,6 +694,25 @@ def test_an_unreadable_source_is_no_bug_and_is_not_waited_for(name, tmp_path, mo
         done = visioncal(*(word.format(tmp_path / name) for word in command.split())).refused()
         assert done.err.startswith("error: ")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_may_not_be_searched_is_said_with_its_rights(tmp_path, monkeypatch):
+    """Not by its rights themselves, which hold no administrator back."""
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    stat = Path.stat
+
+    def refused(path: Path, *, follow_symlinks: bool = True) -> os.stat_result:
+        if closed in path.parents:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat(path, follow_symlinks=follow_symlinks)
+
+    monkeypatch.setattr(Path, "stat", refused)
+    for words in (("calibrate", closed, "-o", tmp_path / "out"), ("doctor", closed)):
+        done = visioncal(*words).refused()
+        assert f"error: {closed}" in done.err
+        assert "may not be read by this user" in done.err
+        assert "chmod u+rwx" in done.err
 
 
 @pytest.mark.slow

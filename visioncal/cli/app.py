@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from errno import ENAMETOOLONG
+from errno import EACCES, ENAMETOOLONG
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TextIO, cast
@@ -87,6 +87,17 @@ def _options(
     """Options of the application itself."""
 
 
+# Errors of the operating system at any path, and their next step.
+_REFUSED = {
+    ENAMETOOLONG: ("is longer than the name of any file", ""),
+    EACCES: (
+        "may not be read by this user",
+        "Look at its rights and those of the folder around it: a folder needs x to be searched "
+        "(chmod u+rwx).",
+    ),
+}
+
+
 def main() -> None:
     """Runs the command line; an error ends with one message and status 2, a bad result with 3."""
     # Commands compute on one BLAS thread. Loaded by both numpy and scipy, BLAS would start one a
@@ -113,9 +124,10 @@ def main() -> None:
         except VisioncalError as error:
             _refuse(error)
         except OSError as error:
-            if error.errno != ENAMETOOLONG:
+            if error.errno not in _REFUSED:
                 raise
-            _refuse(DataError(f"{error.filename} is longer than the name of any file."))
+            words, step = _REFUSED[error.errno]
+            _refuse(DataError(f"{error.filename} {words}.", next_step=step))
 
 
 def _refuse(error: VisioncalError) -> None:
