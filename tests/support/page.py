@@ -16,8 +16,8 @@ import pytest
 from support import played
 from support.browser import CHROMIUM
 
-# Longer than anything takes that comes at all [ms].
-PATIENT_MS = 30_000
+# Longer than anything takes that comes at all, beside other suites, too [ms].
+PATIENT_MS = 90_000
 
 
 def free_port() -> int:
