@@ -504,3 +504,22 @@ def test_depth_in_floats_is_in_metres(tmp_path):
         cv2.imwrite(str(tmp_path / f"in/depth_{at}.tiff"), np.full((72, 128), 0.9, np.float32))
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", *BOARD).good()
     assert "it is the views' depth, in metres unless" in done.err
+
+
+def test_joints_behind_their_count_are_read(tmp_path):
+    """As RobWork prints them; without pictures, what is there is said."""
+    joints = np.random.default_rng(2).uniform(-2, 2, (7, 6)).round(6)
+    rows = (f"Q[6]{{{', '.join(map(repr, row))}}}   " for row in joints.tolist())
+    write(tmp_path / "autopose.txt", "\n".join(rows))
+    fields = read_fields(tmp_path / "autopose.txt")
+    assert joint_names(fields, ()) == ("Q",)
+    np.testing.assert_array_equal(fields.numbers["Q"], joints)
+    refused = visioncal("convert", tmp_path / "autopose.txt", tmp_path / "out", *BOARD[2:])
+    refused.refused("has 7 joint angles of the robot, but neither images nor poses")
+
+
+def test_pixels_beside_touched_points_are_named(tmp_path):
+    numbers = np.random.default_rng(3).uniform(100, 900, (9, 5)).round(2).tolist()
+    write(tmp_path / "touched.csv", "u,v,x,y,z\n" + "\n".join(str(row)[1:-1] for row in numbers))
+    refused = visioncal("convert", tmp_path / "touched.csv", tmp_path / "out", *BOARD[2:])
+    refused.refused("u, v and x, y, z are pixels and places of 9 points", "record --page")

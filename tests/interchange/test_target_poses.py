@@ -259,6 +259,44 @@ def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
         np.testing.assert_allclose(session.corners[view.number].px, points, atol=1e-6)
 
 
+@pytest.mark.parametrize("away_deg", [0.0, 3.0])
+@pytest.mark.parametrize("left_stands", [True, False])
+def test_of_many_links_the_one_that_turns_as_the_board_is_taken(tmp_path, away_deg, left_stands):
+    """By the corners; where it agrees too badly, too, it is the one that is asked for."""
+    poses, seen = turning(12)
+    rng = np.random.default_rng(3)
+    away = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(away_deg), (12, 3))).as_matrix()
+    other = np.tile(poses[:1], (12, 1, 1)) if left_stands else poses[rng.permutation(12)]
+    right = poses.copy()
+    right[:, :3, :3] = poses[:, :3, :3] @ away
+    sides = {"left_hand": other, "right_hand": right}
+    rows = [
+        {"corners": px.tolist()}
+        | {
+            name: {
+                "position": link[at, :3, 3].tolist(),
+                "orientation": Rotation.from_matrix(link[at, :3, :3]).as_quat().tolist(),
+            }
+            for name, link in sides.items()
+        }
+        for at, px in enumerate(corners_px(seen))
+    ]
+    write(tmp_path / "in.json", rows)
+    said = ["--mount", "eye-in-hand", "--target", "checkerboard_13x10_15mm"]
+    done = visioncal(
+        "convert", tmp_path / "in.json", tmp_path / "out", *said, "--resolution", "640,400"
+    )
+    if away_deg:
+        said = done.refused("Which of these are the robot's poses").err
+        command = shlex.split(said.splitlines()[-1])
+        assert command[-1] == "right_hand.position,right_hand.orientation"
+    else:
+        done.good()
+        found = Session.load(tmp_path / "out").views
+        for view, pose in zip(found, poses, strict=True):
+            np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
+
+
 def test_rotations_stand_first_in_rows_of_which_some_are_missing(tmp_path):
     poses, seen, mount = world()
     for name, side, first in (("gripper2base", poses, 1), ("target2cam", seen, 1)):

@@ -244,9 +244,10 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
         saw |= foreign.camera.present
     dropped = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
     if len(dropped) == len(saw):
+        states = "poses" if foreign.robot.present.any() else "joint angles"
         raise DataError(
-            f"{foreign.name} has {len(saw)} poses of the robot, but neither images nor poses of "
-            "the target: nothing says what a camera saw.",
+            f"{foreign.name} has {len(saw)} {states} of the robot, but neither images nor poses "
+            "of the target: nothing says what a camera saw.",
             culprits=[foreign.robot.places[0]],
             next_step="Name the images with --images, or the target's poses with --camera-"
             f"{named_by(foreign.robot.places[0])} or --camera-file. Touches of a point need a "

@@ -235,6 +235,7 @@ def _recordings(
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         form=fields.form,
         makers=makers_of(names["robot"]),
+        fields=names["robot"],
         views=fields.views or view_numbers(fields),
         columns=columns,
         notes=(*notes, *pairing.notes),

@@ -147,6 +147,7 @@ class ForeignRecording:
     # The same source otherwise read, the likeliest first; each with how unlikely it is beside this.
     rivals: tuple[tuple[int, "ForeignRecording"], ...] = ()
     doubt: DataError | None = None  # The error where nothing decides between these.
+    fields: tuple[str, ...] = ()  # Those of the robot's poses.
     title: str = ""  # The session's name, where it is not that of the source.
 
 
@@ -174,7 +175,7 @@ def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
     """The given rows of a recording, in the given order."""
     views = foreign.views or tuple(range(len(foreign.robot)))
     return replace(
-        chosen_rows(replace(foreign, views=views), rows, "notes", "rivals", "makers"),
+        chosen_rows(replace(foreign, views=views), rows, "notes", "rivals", "makers", "fields"),
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
         columns={

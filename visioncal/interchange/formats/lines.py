@@ -39,8 +39,9 @@ _ASSIGNED = re.compile(rf"\b(\w+)[ \t]*=[ \t]*({_LITERAL})")
 _MOVED = re.compile(rf"\bmove[jlpc]\s*\(\s*(?:get_inverse_kin\s*\(\s*)?({_LITERAL}|\w+)")
 # Numbers of a position or a quaternion, a line each below its heading.
 _PARTS = ("x", "y", "z", "w")
-# A list within a line of text.
-_INNER = re.compile(r"[\[(]([^\[\]()]*)[\])]")
+# A list within a line of text, and one behind the count of its numbers, as `Q[6]{..}` of RobWork.
+_INNER = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
+COUNTED = re.compile(r"\s*\w*\[[0-9]+\]\s*\{")
 # Lines with their places.
 _Lines: TypeAlias = Sequence[tuple[str, str]]
 

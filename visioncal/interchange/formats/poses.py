@@ -38,6 +38,7 @@ from visioncal.interchange.formats.pose_words import (
 _OF_POSES = (16, 12, 9, 7, 6, 4, 3)
 _NO_POSE = re.compile(
     r"joint|关节|關節|axis|axes|angles|wrench|speed|force|torque|twist|vel|accel|effort|corner|intrins"
+    r"|(?:^|[._])q$"
 )
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
 _AXIS_FIRST = re.compile(r"(?<![^ .])([wxyz]|[prt][xyz]|q[wxyz])_([a-z]+)$", re.IGNORECASE)

@@ -44,6 +44,7 @@ from visioncal.interchange.formats.fields import (
 )
 from visioncal.interchange.formats.keys import is_image_name
 from visioncal.interchange.formats.lines import (
+    COUNTED,
     IMAGE,
     PROGRAMS,
     arrays_in,
@@ -239,6 +240,7 @@ def _of_lines(text: str, path: Path) -> Fields:
     lines = placed(text, path)
     # Lists over several lines, as OpenCV prints a matrix.
     is_wrapped = text.lstrip().startswith("[") and len(closed(lines)) < len(lines)
+    is_wrapped |= COUNTED.match(text) is not None
     if is_wrapped and (blocks := blocks_of(lines, path)):
         return blocks
     try:

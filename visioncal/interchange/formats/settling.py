@@ -82,6 +82,7 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     readings = [(0, foreign), *rivals]
     other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
     why, fault = "too few rows have a pose and what the camera saw", None
+    doubt = foreign.doubt
     searches = dict[Path, Searched]()
     if _is_still(foreign):
         # No image need be searched for what no reading can change.
@@ -104,16 +105,17 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
         other_orders = [*filter(seen.may_agree, other_orders)]
         is_last = most == _TESTED[-1] or seen.count < most
         for tried in (readings, other_orders):
-            found, reason = _tested(tried, seen, is_last=is_last)
-            why = reason if tried is readings else why
+            found, reason, closest = _tested(tried, seen, is_last=is_last)
             if found is not None:
                 return found
+            is_read = tried is readings
+            why, doubt = (reason, _with_fields(foreign, closest)) if is_read else (why, doubt)
             if why.startswith(ONE_AXIS):
                 # No order of the numbers closes the chain better than others.
                 break
     is_clear = bool(searches) and fault is None
     stored = _by_stored_poses(foreign, progress) if is_clear else None
-    return stored or _untested(foreign, why, fault)
+    return stored or _untested(replace(foreign, doubt=doubt), why, fault)
 
 
 def _by_stored_poses(
@@ -124,7 +126,8 @@ def _by_stored_poses(
         return None
     stored = replace(foreign, images=(), corners=(), target=None, rivals=())
     with suppress(VisioncalError):
-        found, _ = _tested([(0, stored)], _Seen.of(stored, _TESTED[-1], progress, {}), is_last=True)
+        seen = _Seen.of(stored, _TESTED[-1], progress, {})
+        found, *_ = _tested([(0, stored)], seen, is_last=True)
         if found is not None:
             note = (
                 "The images are left aside: no reading of the robot's poses fits them, but one "
@@ -185,27 +188,32 @@ def _is_still(foreign: ForeignRecording) -> bool:
 def _of_turning(foreign: ForeignRecording) -> ForeignRecording:
     """The recording without series in which the robot does not turn, where it does in others."""
     readings = [(0, foreign), *foreign.rivals]
-    places = {each.robot.places for _, each in readings if not _is_still(each)}
+    turning = [(rank, each) for rank, each in readings if not _is_still(each)]
+    places = {each.robot.places for _, each in turning}
+    least = min((rank for rank, _ in turning), default=np.inf)
+    # Of fields of the same rows those that stand still are frames, where others are as likely.
     kept = [
         (rank, each)
         for rank, each in readings
-        if not _is_still(each) or places <= {each.robot.places}
+        if not _is_still(each) or (places <= {each.robot.places} and rank < least)
     ]
     (_, first), *others = kept
     same = len(kept) == len(readings)
-    return foreign if same else replace(first, rivals=tuple(others), doubt=foreign.doubt)
+    doubt = _with_fields(foreign, first)
+    return foreign if same else replace(first, rivals=tuple(others), doubt=doubt)
 
 
 def _tested(
     readings: Sequence[tuple[int, ForeignRecording]], seen: "_Seen", *, is_last: bool
-) -> tuple[ForeignRecording | None, str]:
-    """The reading that agrees best with what was seen, or why the first does not.
+) -> tuple[ForeignRecording | None, str, ForeignRecording | None]:
+    """The reading that agrees best with what was seen, or why the first does not; and the closest.
 
     Raises DataError where several agree alike, are not the same, and no more rows can tell.
     """
     found: list[tuple[float, int, ForeignRecording]] = []
+    scores = dict[int, float]()
     why, others, of_camera = "", list[Guess](), list[ForeignRecording]()
-    for rank, item in readings:
+    for at, (rank, item) in enumerate(readings):
         try:
             guess = seen.guess(item)
         except VisioncalError as error:
@@ -215,9 +223,9 @@ def _tested(
             of_camera.append(item)
             continue
         why = why or guess.sentence.rstrip(".")
+        scores[at] = score = guess.best.log_posterior - CLEAR * rank
         if guess.stands_out or guess.declared.fit.closes:
             done = applied_reading(item, guess, is_measured=seen.run is not None)
-            score = guess.best.log_posterior - CLEAR * rank
             found += [] if done is None else [(score, rank, done)]
             is_other = guess.stands_out and guess.best.hypothesis.mount != item.mount
             others += [guess] if done is None and is_other else []
@@ -234,16 +242,26 @@ def _tested(
             next_step="Name the poses that the robot reported with --robot-key or --robot-columns, "
             f"or their file; {SWITCH_OFF}.",
         )
+    closest = readings[max(scores, key=scores.__getitem__)][1] if scores else None
     if not found:
-        return None, why
+        return None, why, closest
     score, rank, best = max(found, key=lambda each: each[0])
     alike = (each for at, same, each in found if same == rank and at > score - CLEAR)
     doubt = next((item.doubt for _, item in readings), None)
     if doubt is not None and not all(_are_same(best, each) for each in alike):
         if not is_last:
-            return None, why
+            return None, why, closest
         raise doubt
-    return best, ""
+    return best, "", best
+
+
+def _with_fields(foreign: ForeignRecording, closest: ForeignRecording | None) -> DataError | None:
+    """The doubt of a recording, with the fields of the reading that agrees best proposed."""
+    doubt, first = foreign.doubt, ",".join(foreign.fields)
+    if doubt is None or closest is None or first not in doubt.next_step or not first:
+        return doubt
+    step = doubt.next_step.replace(first, ",".join(closest.fields))
+    return DataError(doubt.message, culprits=doubt.culprits, next_step=step)
 
 
 def _are_same(first: ForeignRecording, second: ForeignRecording) -> bool:

@@ -22,7 +22,7 @@ from visioncal.interchange.formats.fields import Fields, appearance, unit_by_siz
 from visioncal.interchange.formats.file_search import DRAWN, FileGroup
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions
 from visioncal.interchange.formats.pose_words import PoseFields
-from visioncal.interchange.formats.poses import points_in, possible_poses
+from visioncal.interchange.formats.poses import columns_named, points_in, possible_poses
 from visioncal.interchange.formats.sources import Source, rows_in
 
 # Fewest pairs of points, and the largest residual of a rigid motion that maps one side's to the
@@ -245,7 +245,18 @@ def _broken_rotations(source: Source) -> list[str]:
 
 
 def check_points(source: Source) -> None:
-    """Raises DataError where a source has pairs of points without rotations."""
+    """Raises DataError where a source has pairs of points, or pixels and points, alone."""
+    for fields in rows_in(source):
+        px, places = (columns_named(fields, axes) for axes in (("u", "v"), (*"xyz",)))
+        if px and places and not possible_poses(fields):
+            raise DataError(
+                f"{source.path.name}: {', '.join(px)} and {', '.join(places)} are pixels and "
+                f"places of {len(fields)} points, as of touched ones, without a pose of the robot. "
+                "One picture places a camera, and says nothing of how the arm errs.",
+                culprits=[fields.places[0]],
+                next_step="Before a fixed camera screw a board to the flange, and give pictures "
+                "with the pose of each: visioncal record --page takes both.",
+            )
     if pairs := point_pairs(source):
         if broken := _broken_rotations(source):
             raise DataError(
