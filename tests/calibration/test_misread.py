@@ -710,6 +710,25 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     assert visioncal.calibrate(mended).verdict.status == "good"
 
 
+def test_poses_are_left_handed_where_markers_show_that_images_are_not_mirrored(tmp_path):
+    cell, mirror = simulate(CellOptions(views=14, seed=3)), np.diag([1.0, -1.0, 1.0, 1.0])
+    Session.from_corners(
+        [(seen.ids, seen.px) for seen in cell.corners],
+        mirror @ cell.robot.base_from_flange @ mirror,
+        replace(cell.options.target, square_sigma_m=1e-7),
+        cell.stated[""].resolution,
+        mount="eye-in-hand",
+    ).save(tmp_path / "cell")
+    done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
+    assert "With the robot's poses in a left-handed frame" in done.said
+    assert "images mirrored" not in done.said
+    command = printed_commands(done.said)[0]
+    assert "--guess --yes --mirror-poses" in command
+    typed("convert", tmp_path / "cell", tmp_path / "mended", "--mend-images").refused("mirrored")
+    converted(tmp_path / "cell", tmp_path / "fixed", "--yes", "--mirror-poses").good()
+    assert visioncal.calibrate(tmp_path / "fixed").verdict.status == "good"
+
+
 def test_an_unknown_robot_is_named_with_the_correction(cell):
     document = cell / "session.toml"
     document.write_text(document.read_text("utf-8").replace('"ur10e"', '"ur10ee"'), "utf-8")

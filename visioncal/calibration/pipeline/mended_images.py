@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses, of_pair
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
-from visioncal.calibration.stages.cameras import exchanged_columns
+from visioncal.calibration.stages.cameras import exchanged_columns, shows_print
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.corner_sizes import scaled_px
 from visioncal.calibration.stages.detect import is_scaled
@@ -129,8 +129,10 @@ def _turned(state: RunState | None, views: Sequence[View]) -> dict[str, int]:
 
 def _is_mirrored(state: RunState | None) -> bool:
     """Whether robot and camera agree only with one of them mirrored."""
-    if state is None or any(
-        note.startswith(_EXCHANGED) for note in state.session.declaration.corrected
+    if (
+        state is None
+        or shows_print(state)
+        or any(note.startswith(_EXCHANGED) for note in state.session.declaration.corrected)
     ):
         return False
     with suppress(VisioncalError):

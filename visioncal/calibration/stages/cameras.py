@@ -249,6 +249,15 @@ def _of_one_size(
     return seen, {view: at for view, at in corners.items() if view not in scaled.views}
 
 
+def shows_print(seen: Observed) -> bool:
+    """Whether images are none of a mirror: the markers in them are as printed."""
+    session, corners = seen.session, seen.corners
+    views = [view for view in session.views if view.number in corners]
+    pairs = [(corners[view.number], session.boards[session.board_of(view)]) for view in views]
+    has_markers = all(target.dictionary and not target.is_rig for _, target in pairs)
+    return bool(pairs) and has_markers and not are_from_behind(pairs)
+
+
 def exchanged_columns(seen: Observed) -> bool:
     """Whether u and v are exchanged in the corners.csv of one camera, as its lens shows.
 

@@ -20,7 +20,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
     open_pairs,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cameras import exchanged_columns
+from visioncal.calibration.stages.cameras import exchanged_columns, shows_print
 from visioncal.calibration.stages.cell import rows_of_robot, stop_of, stops_by_view
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.other_board import MEND_IMAGES
@@ -44,6 +44,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import (
     BY_HAND,
     CALIBRATE,
+    CALIBRATE_FIXED,
+    GUESS,
     READ_AGAIN,
     Finding,
     Option,
@@ -70,6 +72,13 @@ _MIRRORED = calibrating(
     "images and corners are mirrored back, and",
     "it. Only where the robot's frame is left-handed, convert with --guess --yes --mirror-poses.",
     MEND_IMAGES,
+)
+_LEFT_HANDED = calibrating(
+    "The images are not mirrored, as the markers in them are not: one axis of the robot's frame "
+    "points the other way. Write a copy in which y of its poses is mirrored, try its axes by one "
+    "known motion before the robot moves by them, and",
+    "it.",
+    f"{GUESS} --mirror-poses && {CALIBRATE_FIXED}",
 )
 _LOST_TURNS = Remedy(
     "Where the poses were made of the robot's angles, convert these to radians first (np.deg2rad, "
@@ -269,13 +278,8 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
         if within is not None and not guess.best.is_of_robot:
             step = _rows_apart(run, guess.best.rows_apart, *within)
-        words = guess.sentence
-        if robot.mirrored:
-            step = _MIRRORED if run.cameras else replace(_MIRRORED, command="")
-        if robot.mirrored and exchanged_columns(run):
-            step = EXCHANGE_COLUMNS
-            words = f"In corners.csv, u_px and v_px are exchanged, as the lens shows. {words}"
-        yield Finding("misread_poses", words, step)
+        found = Finding("misread_poses", guess.sentence, step)
+        yield _mirrored(run, found) if robot.mirrored else found
     elif guess.is_open:
         step = Remedy(_WHICH)
         if guess.positions:
@@ -285,6 +289,17 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
             step = mending("positions are read otherwise", option, write)
         yield Finding("misread_poses", guess.sentence, step)
     yield from unknown
+
+
+def _mirrored(run: RunState, found: Finding) -> Finding:
+    """The finding that poses or images are mirrored, with the one that it is where that shows."""
+    if exchanged_columns(run):
+        words = f"In corners.csv, u_px and v_px are exchanged, as the lens shows. {found.words}"
+        return replace(found, words=words, do=EXCHANGE_COLUMNS)
+    if shows_print(run):
+        words = found.words.replace("the images mirrored, or ", "")
+        return replace(found, words=words, do=_LEFT_HANDED)
+    return replace(found, do=_MIRRORED if run.cameras else replace(_MIRRORED, command=""))
 
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
