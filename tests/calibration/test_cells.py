@@ -277,7 +277,11 @@ def test_robots_of_a_cell_are_read_anew_one_by_one(tmp_path, monkeypatch, three,
 
 @pytest.mark.parametrize(
     ("column", "names", "stops"),
-    [("camera", ("left", "right"), (4, 5, 6)), slow("target", ("plate_a", "floor"), (3, 7, 9))],
+    [
+        ("camera", ("left", "right"), (4, 5, 6)),
+        slow("target", ("plate_a", "floor"), (3, 7, 9)),
+        ("robot", ("a", "b"), (4, 5, 6)),
+    ],
 )
 def test_rows_with_the_name_of_another_camera_or_board_are_named(column, names, stops):
     right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=CAMERAS["fine"])
@@ -286,17 +290,82 @@ def test_rows_with_the_name_of_another_camera_or_board_are_named(column, names, 
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     wrong = dict[int, str]()
     for view, row in zip(session.views, cells, strict=True):
-        if view.stop in stops and row["camera"] != "hand" and row[column] in other:
+        # Both robots' poses at a stop are exchanged, whatever their rows see.
+        is_spared = row["camera"] == "hand" and column != "robot"
+        if view.stop in stops and not is_spared and row[column] in other:
             row[column] = wrong[view.number] = other[row[column]]
     rows = [[row[name] for name in session.columns] for row in cells]
     found = calibrate(session.with_content(document=session.document, cells=rows))
     (cause,) = (at for at in found.verdict.causes if at.kind == "misnamed_rows")
     assert cause is found.verdict.causes[0]
-    assert {*cause.views} == {*wrong}
+    # Rows may have a robot's pose alone.
+    assert {*cause.views} == {*wrong} or column == "robot"
     for name in names:
-        views = [view for view in cause.views if wrong[view] == name]
+        views = [view for view in sorted(wrong) if wrong[view] == name]
         assert f"{other[name]} for {name} in column {column} of view" in cause.do.words
         assert f"column {column} of {view_words(views)}" in cause.do.words
+
+
+def test_pictures_of_a_camera_on_one_arm_before_a_board_on_another_that_are_a_stop_apart(tmp_path):
+    rng = np.random.default_rng(5)
+    flange_a, flange_b = (
+        exp(np.column_stack([rng.normal(0, 0.5, (16, 3)), rng.uniform(0.2, 0.6, (16, 3))]))
+        for _ in "ab"
+    )
+    x, y, base_b, top = exp(
+        np.array([[0.2, 0.1, 1.0, 0.03, 0.05, 0.08], [0.1, 3.0, 0.2, 0.0, 0.02, 0.06],
+                  [0.0, 0.0, 2.9, 1.3, 0.1, 0.0], [2.2, 0.3, 0.1, 0.6, -0.9, 0.9]])
+    )  # fmt: skip
+    noise = exp(rng.normal(0, 1e-4, (2, 16, 6)))
+    plate = base_b @ flange_b @ y
+    by_hand, by_top = invert(flange_a @ x) @ plate @ noise[0], invert(top) @ plate @ noise[1]
+    # From stop 9 on, the hand's pictures are those of the stop before.
+    by_hand[9:] = by_hand[8:-1].copy()
+    cft = [f"cft_{name}" for name in POSE]
+    rows = [",".join(["view", "stop", "camera", "target", "robot", *POSE, *cft])]
+    for stop in range(16):
+        states = [
+            ("hand", "plate", "a", flange_a, by_hand),
+            ("top", "plate", "b", flange_b, by_top),
+        ]
+        for camera, target, robot, flange, seen in states:
+            numbers = [*pose_row(flange[stop]).values(), *pose_row(seen[stop]).values()]
+            rows.append(",".join(map(str, [len(rows) - 1, stop, camera, target, robot, *numbers])))
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "views.csv").write_text("\n".join(rows) + "\n", "utf-8")
+    (tmp_path / "cell" / "session.toml").write_text(
+        'schema = 1\nname = "cell"\n[robots]\na = {}\nb = {}\n[cameras]\nhand = {}\ntop = {}\n'
+        '[targets]\nplate = "charuco_9x6_30mm"\n[frames]\ncam_hand = "flange_a"\n'
+        'cam_top = "cell"\ntarget_plate = "flange_b"\n',
+        "utf-8",
+    )
+    session = Session.load(tmp_path / "cell")
+    (cause, *_) = calibrate(session).verdict.causes
+    assert cause.kind == "shifted_rows"
+    assert cause.words.startswith("From view 18 on, images of cam_hand are apart from their rows")
+    option = cause.do.option
+    assert str(option) == "--shift 18,20,22,24,26,28,30:-1:images"
+    mended = calibrate(shift_views(session, option.views, -1, of_images=True))
+    assert mended.verdict.status == "good"
+
+
+def test_a_log_that_is_stuck_at_stops_of_two_boards_is_one_finding_with_one_command():
+    cell = simulate(replace(OPTIONS, stops=20))
+    session = cell_session(cell, "cell", seen="poses")
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    # The plate on a is seen at stop 10, the floor by the camera on a at stop 11.
+    of_a = [at for at, row in enumerate(cells) if row["robot"] == "a"]
+    (source,) = {
+        tuple(cells[at][name] for name in POSE) for at in of_a if session.views[at].stop == 9
+    }
+    stuck = [at for at in of_a if session.views[at].stop in (10, 11)]
+    for at in stuck:
+        cells[at] |= dict(zip(POSE, source, strict=True))
+    rows = [[row[name] for name in session.columns] for row in cells]
+    verdict = calibrate(session.with_content(document=session.document, cells=rows)).verdict
+    found = [one for one in verdict.findings if one.kind in ("copied_poses", "wrong_views")]
+    assert [one.kind for one in found] == ["copied_poses"]
+    assert {*found[0].views} == {session.views[at].number for at in stuck}
 
 
 @pytest.mark.slow

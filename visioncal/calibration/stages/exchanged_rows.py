@@ -15,6 +15,9 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 
+# Times by which an outlier is nearer under another name or elsewhere: by chance, two hardly are.
+_NEARER = 30.0
+
 
 def other_stops(
     problem: Problem,
@@ -106,10 +109,44 @@ def other_names(
         squares = np.full(len(pairs), np.inf)
         squares[known] = by_noise_alone(as_named.subset(known), fit)
         best = int(squares.argmin())
-        # Times by which an outlier is nearer where it has another name: by chance, two hardly are.
-        if best and 30.0**2 * squares[best] < squares[0]:
+        if best and _NEARER**2 * squares[best] < squares[0]:
             found[at] = pairs[best]
     return found
+
+
+def other_robots(problem: Problem, fit: Solution, out: IntArray) -> dict[int, tuple[str, str]]:
+    """Two robots that have each other's poses at its stop, by outlier among (n,) that fits so."""
+    found = dict[int, tuple[str, str]]()
+    part = problem.subset(np.isin(np.arange(len(problem)), out))
+    stated = by_noise_alone(part, fit)
+    for first, second in combinations(problem.poses, 2):
+        poses = dict(problem.poses)
+        poses[first], poses[second] = poses[second], poses[first]
+        other = replace(part, poses=poses)
+        known = np.isfinite(other.predicted(fit.state)[:, 0, 0])
+        nearer = _NEARER**2 * by_noise_alone(other.subset(known), fit) < stated[known]
+        found |= dict.fromkeys(np.sort(out)[known][nearer].tolist(), (first, second))
+    return found
+
+
+def shifted_images(
+    problem: Problem, fit: Solution, out: IntArray, moves: Sequence[Move]
+) -> tuple[int, list[int]]:
+    """Number of stops by which images of outliers (n,) of one camera are apart, and which are.
+
+    None are where that is zero: more than half of them fit the stop so many before, or after.
+    """
+    seen, found = problem.observations, dict[int, list[int]]()
+    squares = {at: _at_stops(problem, fit, at, moves, np.eye(4)) for at in out.tolist()}
+    for by in (-1, 1, -2, 2, -3, 3):
+        other = {at: seen.stops[at] + by for at in squares}
+        found[by] = [
+            at
+            for at, each in squares.items()
+            if 0 <= other[at] < len(each) and _NEARER**2 * each[other[at]] < each[seen.stops[at]]
+        ]
+    by = max(found, key=lambda some: len(found[some]))
+    return (by, found[by]) if 2 * len(found[by]) > len(out) else (0, [])
 
 
 def exchanged(

@@ -38,7 +38,7 @@ from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, S
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO
-from visioncal.core.number_format import figure, robot_words
+from visioncal.core.number_format import figure, robot_words, view_words
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import (
@@ -161,7 +161,8 @@ def with_undone(run: RunState) -> RunState:
             subject = (
                 f"{subject[0].upper()}{subject[1:]}, in its rows of {pair.camera} and {pair.target}"
             )
-            found, do = mistake.found, mistake.found.do
+            found = _with_rest_of_log(run, robot, mistake.found)
+            do = found.do
             if do is not None and do.option.name == "views":
                 # The other views are those of all pairs.
                 others = [at.number for at in run.session.views if at.number not in found.views]
@@ -176,6 +177,23 @@ def with_undone(run: RunState) -> RunState:
             commands |= {command} - {""}
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
+
+
+def _with_rest_of_log(run: RunState, robot: str, found: Finding) -> Finding:
+    """A finding on repeated poses of a robot with its other rows that repeat these, too."""
+    if found.kind != "copied_poses":
+        return found
+    poses, stops = run.robots[robot].base_from_flange, stops_by_view(run.session)
+    more = set[int]()
+    for view in found.views:
+        alike = [at for at, pose in poses.items() if np.array_equal(pose, poses[view])]
+        first = min(stops[at] for at in alike)
+        more |= {at for at in alike if stops[at] > first}
+    rest = sorted(more.difference(found.views))
+    if not rest:
+        return found
+    words = f"{found.words} So {'do' if len(rest) > 1 else 'does'} {view_words(rest)}."
+    return replace(found, words=words, views=tuple(sorted((*found.views, *rest))))
 
 
 def _is_of_images(

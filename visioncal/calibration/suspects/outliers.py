@@ -6,8 +6,15 @@ from itertools import chain, pairwise
 
 import numpy as np
 
+from visioncal.calibration.stages.cell import stop_of
 from visioncal.calibration.stages.cell_fit import CellFit
-from visioncal.calibration.stages.exchanged_rows import exchanged, other_names, other_stops
+from visioncal.calibration.stages.exchanged_rows import (
+    exchanged,
+    other_names,
+    other_robots,
+    other_stops,
+    shifted_images,
+)
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.moved_views import (
     KNOCKED,
@@ -17,8 +24,8 @@ from visioncal.calibration.suspects.moved_views import (
     pushed_base,
     turned_back,
 )
-from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, listed, some_of, view_words
+from visioncal.core.limits import FEWEST_VIEWS, CalibrationLimits
+from visioncal.core.number_format import counted, figure, listed, ranges, some_of, view_words
 from visioncal.core.transforms import distances, invert, pose_difference
 from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Option, Remedy, mending
@@ -28,7 +35,7 @@ from visioncal.session.frames import object_name
 from visioncal.vision.targets import half_turn_of, rotation_transforms
 
 # Kinds of findings, which others name.
-EXCHANGED, MISNAMED = "exchanged_views", "misnamed_rows"
+EXCHANGED, MISNAMED, SHIFTED = "exchanged_views", "misnamed_rows", "shifted_rows"
 # Rows that no chance has fit another name.
 _FEWEST_MISNAMED = 2
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
@@ -104,6 +111,8 @@ def explained_outliers(
     is_pair = session.has_one_pair
     if not faults and (not is_pair or len(session.boards) > 1):
         faults += _misnamed(cell_fit, outliers)
+    if not faults and not is_pair:
+        faults += (*_of_other_robots(cell_fit, outliers), *_of_other_images(cell_fit, outliers))
     if not faults:
         faults += of_moved(cell_fit, outliers) if is_pair else pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
@@ -165,6 +174,57 @@ def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     words = f"{{views}} were left out: they fit with {named}, as rows with exchanged names do."
     do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
     yield fault_of(cell_fit, MISNAMED, every, words, do, short)
+
+
+def _of_other_robots(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
+    """Outliers at stops at which two robots have each other's poses."""
+    inliers, cell = cell_fit.inlier_fit, cell_fit.cell
+    found = other_robots(inliers.problem, inliers.fit, outliers)
+    for pair in {*found.values()}:
+        rows = sorted(at for at, robots in found.items() if robots == pair)
+        if len(rows) < _FEWEST_MISNAMED:
+            continue
+        stops = sorted({cell.stops[cell.rows[at].station] for at in rows})
+        found_views = [view for view in cell.session.views if stop_of(view) in stops]
+        edits = [
+            f"{other} for {robot} in column robot of "
+            f"{view_words([view.number for view in found_views if view.cell('robot') == robot])}"
+            for robot, other in (pair, pair[::-1])
+        ]
+        where = f"stop{'s' * (len(stops) > 1)} {ranges(stops)}"
+        short = f"robots {listed(pair)} have each other's poses at {where}"
+        words = f"{{views}} were left out: {short}."
+        do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
+        yield fault_of(cell_fit, MISNAMED, rows, words, do, short)
+
+
+def _of_other_images(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
+    """Outliers of one camera whose images are some stops apart, whatever moves before it."""
+    inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
+    by_camera = defaultdict[str, list[int]](list)
+    for at in outliers.tolist():
+        by_camera[rows[at].seer].append(at)
+    for camera, some in by_camera.items():
+        by, found = shifted_images(inliers.problem, inliers.fit, np.array(some), inliers.moves)
+        if len(found) < FEWEST_VIEWS:
+            continue
+        seen = [at for at, row in enumerate(rows) if row.seer == camera]
+        # A view whose stop has no row is of the same run.
+        first, last = seen.index(found[0]), seen.index(found[-1])
+        while first > 0 and seen[first - 1] in some:
+            first -= 1
+        run = seen[first : last + 1]
+        apart = tuple(rows[at].view for at in run)
+        when = f"to view {apart[-1]}" if last + 1 < len(seen) else "on"
+        stop = f"{counted(abs(by), 'stop')} {'later' if by > 0 else 'earlier'}"
+        short = f"its image was taken {stop}"
+        words = (
+            f"from view {apart[0]} {when}, images of {camera} are apart from their rows: each was "
+            f"taken {stop}. They were left out."
+        )
+        option = Option("shift", f"{by}:images", apart)
+        do = mending("each image has its own stop", option)
+        yield fault_of(cell_fit, SHIFTED, [at for at in run if at in some], words, do, short)
 
 
 def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[PoseFault]:
