@@ -249,6 +249,24 @@ def test_the_budget_is_that_of_places_where_the_views_looked(mount, is_stated):
     assert calibration.uncertainty.total_mm == pytest.approx(np.sqrt(np.mean(squares)), rel=2e-3)
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_the_calibrations_own_board_has_the_size_that_was_found(mount):
+    size = 1.004
+    cell = simulate(CellOptions(mount=mount, views=20, board_scale=size, cut_views=0.0, seed=2))
+    calibration, corners = calibration_of(cell), size * corner_positions(BOARD)
+    assert calibration.board.values[0] == pytest.approx(size - 1.0, abs=5e-4)
+    away_mm = []
+    for at, pose in enumerate(cell.cam_from_target):
+        px = project(cell.options.camera, corners @ pose[:3, :3].T + pose[:3, 3])
+        flange = np.eye(4) if mount == "eye-to-hand" else cell.robot.base_from_flange[at]
+        seen = Corners(0, np.arange(len(px)), px, 0.7)
+        place = locate_target(calibration, seen, BOARD, flange)
+        edge = next(iter(cell.transforms.values()))
+        away_mm.append(1e3 * np.linalg.norm(place.p_base - (flange @ edge @ pose)[:3, 3]))
+    # As stated the board would be 0.4 % of half a metre nearer.
+    assert np.sqrt(np.mean(np.square(away_mm))) < 0.5
+
+
 def test_a_place_that_cannot_be_located_is_refused_by_name(in_hand):
     cell, calibration = in_hand
     at = stand(cell, np.random.default_rng(4))

@@ -91,6 +91,7 @@ class CalibratedCamera:
     warnings: tuple[str, ...]  # Reasons not to trust the camera, in sentences.
     # (2,) least and greatest distance at which its views looked; None where unknown.
     distances_m: FloatArray | None
+    calibration: CalibrationContent  # All of it.
 
     @classmethod
     def of(cls, calibration: CalibrationContent) -> Self:
@@ -125,6 +126,7 @@ class CalibratedCamera:
             calibration.noise_dof,
             (bad,) if verdict.status == "bad" else (),
             None if calibration.budget is None else calibration.budget.distances_m,
+            calibration,
         )
 
     @property

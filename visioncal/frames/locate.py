@@ -417,6 +417,7 @@ def locate_target(
 ) -> Located:
     """Position in the base of a point of a target in an image.
 
+    A print by which the camera was calibrated has the size and shape that the calibration found.
     The uncertainty of the target's size is its `square_sigma_m`, taken as independent of the
     calibration: for the board of the calibration, a part of it is counted twice.
 

@@ -10,9 +10,10 @@ from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, Corners, FloatArray, Image, Target
-from visioncal.estimation.appearance import Appearance, Compressed, compress
+from visioncal.core.types import Corners, FloatArray, Image, Target
+from visioncal.estimation.appearance import Appearance, compress
 from visioncal.frames.camera_chain import CalibratedCamera
+from visioncal.results.boards import shape_seen
 from visioncal.vision.board_shape import SCALE, shape_basis
 from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import GREY, poor_image_reason
@@ -94,15 +95,16 @@ def target_pose_candidates(
             culprits=[label],
         )
     noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
+    look = Appearance(eye.camera, shape_seen(eye.calibration, target))
     with one_blas_thread():
         in_model = replace(corners, px=eye.lens.in_model(corners.px))
-        poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
+        poses, kept, squared_sum = _fit_poses(eye, in_model, target, look, label, noise_px)
         stack = CornerStack.of({kept.view: kept}, positions)
         # Mean depth of the corners.
         distance_m = float(depths_m(stack, poses.cam_from_target[:1])[0])
         if eye.lens.field is not None and eye.lens.field.breathing > 0.0:
             in_model = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
-            poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
+            poses, kept, squared_sum = _fit_poses(eye, in_model, target, look, label, noise_px)
         # Each candidate refined, with its Jacobians and corners numbered by its symmetry.
         fits = []
         for at, turn in enumerate(poses.turns):
@@ -110,7 +112,8 @@ def target_pose_candidates(
             ids = np.argsort(rotations(target)[turn])[kept.ids]
             turned = replace(kept, ids=ids).take(np.argsort(ids))
             stack = _stack(eye, turned, positions, noise_px)
-            compressed = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
+            start = poses.cam_from_target[at : at + 1]
+            compressed = compress(stack, shape_basis(target), look, start)
             by_pose = reproject(stack, eye.camera, compressed.cam_from_target, lens=False).by_pose
             by_field = eye.lens.displacements(stack.px, distance_m)
             stack.weigh(by_field)
@@ -167,14 +170,20 @@ def check_image_size(eye: CalibratedCamera, image: Image, label: str) -> None:
 
 
 def _fit_poses(
-    eye: CalibratedCamera, corners: Corners, target: Target, label: str, noise_px: float
+    eye: CalibratedCamera,
+    corners: Corners,
+    target: Target,
+    look: Appearance,
+    label: str,
+    noise_px: float,
 ) -> tuple[ViewPoses, Corners, float]:
     """Candidate poses, the inlier corners of the best, and their squared residuals' sum [px^2]."""
     positions = corner_positions(target)
     for _ in range(3):
         (poses,) = measure_poses({corners.view: corners}, [target], eye.camera, noise_px)
         stack = _stack(eye, corners, positions, noise_px)
-        residuals = _compressed(eye.camera, stack, target, poses.cam_from_target[:1]).residuals
+        start = poses.cam_from_target[:1]
+        residuals = compress(stack, shape_basis(target), look, start).residuals
         passed = gate(stack, residuals)
         if passed.reasons:
             reason = next(iter(passed.reasons.values()))
@@ -194,10 +203,3 @@ def _stack(
     if eye.jitter == 0.0:
         return stack
     return replace(stack, zooms=eye.jitter / max(noise_px, 1e-6) * zooms(stack.px, eye.camera))
-
-
-def _compressed(
-    camera: Camera, stack: CornerStack, target: Target, starts: FloatArray
-) -> Compressed:
-    basis = shape_basis(target)
-    return compress(stack, basis, Appearance(camera, np.zeros(basis.shape[2])), starts)

@@ -18,10 +18,11 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.touches import Tool, robot_noise
 from visioncal.results import Calibration, Edge, Frame
+from visioncal.results.boards import shape_seen
 from visioncal.results.sections import TouchedPoint, TouchTest
 from visioncal.robot.collision import camera_body
 from visioncal.session import Session
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.board_shape import shaped_corners
 
 # Least gap that is read [mm].
 _LEAST_READ_MM = 0.01
@@ -119,7 +120,7 @@ def touch_targets(
     rotation = frame.edge.matrix[:3, :3]
     points = []
     # The four outermost corners, and the one nearest to the middle.
-    places = corner_positions(board)
+    places = shaped_corners(board, shape_seen(calibration, board))
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     chosen = [int(np.argmax((places - middle)[:, :2] @ sign)) for sign in signs]

@@ -14,13 +14,14 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.results import HELD_BACK, Calibration
 from visioncal.results.arm import FUNCTIONS
+from visioncal.results.boards import calibrated_boards
 from visioncal.results.sections import JointFit
 from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.errors import posture_correlation
 from visioncal.session.frames import edge_names
 from visioncal.verification.model_evidence import CalibrationPosterior, RepeatedStops
-from visioncal.vision.board_shape import boards_basis, stated_board_sigma
-from visioncal.vision.targets import numbered_positions, target_from_document
+from visioncal.vision.board_shape import boards_basis
+from visioncal.vision.targets import numbered_positions
 
 # Findings whose views are left out without a cause.
 _NO_CAUSE = ("wrong_views", "lost_views", "unexplained")
@@ -70,16 +71,7 @@ class CalibrationPrior:
         if camera is None or not self.targets:
             return None
         targets, size = tuple(self.targets.values()), len(self.fit.looks)
-        shapes = {
-            "": calibration.board or calibration.rig,
-            **calibration.boards,
-            **calibration.rigs,
-        }
-        boards = [
-            np.zeros(len(stated_board_sigma(target))) if shape is None else shape.values
-            for name, target in self.targets.items()
-            for shape in [shapes.get(name)]
-        ]
+        boards = [board.shape for board in calibrated_boards(calibration)]
         return LensBoardParameters(
             Appearance(camera.camera, np.concatenate(boards)),
             boards_basis(targets),
@@ -186,9 +178,7 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     # The only board may have a name in the session, and so in its transform.
     lone = next((name for name in calibration.edges if name != x_name), z_name)
     edges = (x_name, *(f"{z_name}_{name}" if name else lone for name in names))
-    targets = {
-        name: target_from_document(target, name or "target") for name, target in fit.targets.items()
-    }
+    targets = {board.name: board.target for board in calibrated_boards(calibration)}
     values = np.zeros(0) if fit.arm is None else fit.arm.values
     size, count = 6 * len(edges), 6 * len(edges) + len(fit.looks) + len(values)
     if fit.covariance.shape != (count, count) or not np.allclose(
