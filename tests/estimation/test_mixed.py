@@ -15,8 +15,9 @@ from visioncal.calibration.pipeline.arm_results import misfit_covariance
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.core.levenberg_marquardt import Linearised, levenberg_marquardt
+from visioncal.core.prediction import point_jacobian, through
 from visioncal.core.quantiles import radius95
-from visioncal.core.transforms import LEVER_M, exp, invert, log, point_covariance
+from visioncal.core.transforms import LEVER_M, exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.arm import arm_effect, covariance_of_size
@@ -477,7 +478,7 @@ def test_a_point_is_as_uncertain_as_its_scatter():
     steps = rng.standard_normal((20000, 6)) @ root.T
     seen = (edge @ exp(steps))[:, :3, :3] @ point + (edge @ exp(steps))[:, :3, 3]
     # 20000 draws tell a variance to 1 %.
-    expected = point_covariance(edge, root @ root.T, point)
+    expected = through(point_jacobian(edge, point), root @ root.T)
     np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.04 * np.abs(expected).max())
 
 

@@ -26,6 +26,11 @@ def through(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(jacobian @ covariance @ jacobian.mT)
 
 
+def point_jacobian(a_from_b: FloatArray, point_b: FloatArray) -> FloatArray:
+    """(3, 6) Jacobian of a b-fixed point (3,) in a by the right perturbation of `a_from_b` [m]."""
+    return np.asarray(a_from_b[:3, :3] @ to_points(point_b)[3:])
+
+
 def to_points(points_m: FloatArray) -> FloatArray:
     """Jacobians (..., 6, 6) of rotation and place of points by a twist of their frame.
 

@@ -230,21 +230,6 @@ def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
     return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
 
 
-def point_covariance(edge: FloatArray, covariance: FloatArray, point: FloatArray) -> FloatArray:
-    """Covariance of a point mapped by an uncertain transform.
-
-    Args:
-        edge: (4, 4) `a_from_b`.
-        covariance: (6, 6) of its right perturbation (rotation, translation).
-        point: (3,) in frame b, exact [m].
-
-    Returns:
-        (3, 3) of the point in frame a [m^2].
-    """
-    jacobian = edge[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1)
-    return np.asarray(jacobian @ covariance @ jacobian.T)
-
-
 def distances_m(poses: FloatArray, predicted: FloatArray) -> FloatArray:
     """Distances (...) [m] of (..., 4, 4) poses from predicted ones, rotations on a lever."""
     between = invert(predicted) @ poses

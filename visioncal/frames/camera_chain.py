@@ -20,6 +20,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
+from visioncal.core.prediction import point_jacobian
 from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.results.arm import FUNCTIONS
@@ -252,11 +253,6 @@ class CameraPose:
     def camera_jacobian(self, point_cam: FloatArray) -> FloatArray:
         """(3, 6) Jacobian of a camera-fixed point in the base by the camera's perturbation."""
         return point_jacobian(self.base_from_cam, point_cam)
-
-
-def point_jacobian(a_from_b: FloatArray, point_b: FloatArray) -> FloatArray:
-    """(3, 6) Jacobian of a b-fixed point in a by the right perturbation of `a_from_b`."""
-    return np.asarray(a_from_b[:3, :3] @ np.concatenate([-skew(point_b), np.eye(3)], axis=1))
 
 
 def checked_pose(pose: FloatArray, name: str) -> None:

@@ -10,7 +10,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.directions import SIGMA_LIMIT_M
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
-from visioncal.core.prediction import through
+from visioncal.core.prediction import point_jacobian, through
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.frames.camera_chain import (
@@ -19,7 +19,6 @@ from visioncal.frames.camera_chain import (
     Plane,
     Pose,
     checked_point,
-    point_jacobian,
 )
 from visioncal.frames.located import Located
 from visioncal.results.content import CalibrationContent

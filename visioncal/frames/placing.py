@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import figure, some_of
-from visioncal.core.transforms import skew
+from visioncal.core.prediction import point_jacobian, through
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.points import GroupFit
 
@@ -147,8 +147,7 @@ def worst_of(
         The offset's worst direction in the parent, and the rotation's in the frame itself.
     """
     point, where = (np.zeros(3), "") if centre is None else (centre, " amid the points")
-    at_centre = matrix[:3, :3] @ np.hstack([-skew(point), np.eye(3)])
-    values, vectors = np.linalg.eigh(at_centre @ covariance @ at_centre.T)
+    values, vectors = np.linalg.eigh(through(point_jacobian(matrix, point), covariance))
     # Where two directions are poor, so are all between them, and none has a name.
     along = f"along the {parent}'s {axis_words(vectors[:, -1])}"
     several = origin and values[-2] > SIGMA_LIMIT_M**2

@@ -11,8 +11,9 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, listed, rounded_up
+from visioncal.core.prediction import point_jacobian, through
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, radius95
-from visioncal.core.transforms import compose, invert, point_covariance
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.frames.frame_from_images import seen_frame
@@ -127,8 +128,8 @@ def touch_targets(
     chosen.append(int(np.argmin(np.linalg.norm(places - middle, axis=1))))
     for name, at in {f"corner {index}": places[index] for index in dict.fromkeys(chosen)}.items():
         placed = frame.edge.matrix @ compose(np.eye(3), at)
-        located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
-        covariance = located + rotation @ independent @ rotation.T
+        located = through(point_jacobian(frame.edge.matrix, at), frame.edge.covariance)
+        covariance = located + through(rotation, independent)
         flange = placed @ invert(tip.matrix)
         # Rounded up: no gap as large as the stated limit exceeds it. Reading error of a gap, by a
         # feeler gauge or by eye over a tip [mm].

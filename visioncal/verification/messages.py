@@ -9,7 +9,8 @@ import numpy as np
 from visioncal.core.directions import axis_words
 from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed, view_words
-from visioncal.core.transforms import exp, inverse_right_jacobian, skew
+from visioncal.core.prediction import point_jacobian, through
+from visioncal.core.transforms import exp, inverse_right_jacobian
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import (
     AGAIN,
@@ -349,8 +350,8 @@ def _motion(check: Check, change: PossibleChange, first: int) -> dict[str, Any]:
     shift = moved[:3, :3] @ point * (1.0 + grown) + moved[:3, 3] - point
     # Jacobian of the point with respect to the twist, through its right perturbation.
     right = np.linalg.inv(inverse_right_jacobian(twist))
-    jacobian = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ right
-    metres, sigma_m, along = _length(shift, jacobian @ covariance @ jacobian.T, rotation)
+    jacobian = point_jacobian(moved, point) @ right
+    metres, sigma_m, along = _length(shift, through(jacobian, covariance), rotation)
     rad, sigma_rad, about = _length(twist[:3], covariance[:3, :3], rotation)
     return {
         "moved_mm": 1e3 * metres,
