@@ -54,6 +54,9 @@ class RecordedStops:
     # (12, c) root of the covariance of the edges' further errors, those of an arm without joint
     # angles. More stops do not reduce them.
     edge_error_root: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
+    # (m, 6, 6) covariances of picks at these stops by such errors and by noise, at look and pick,
+    # in the axes of what carries the camera; None where the arm has joint angles.
+    arm_picks: FloatArray | None = None
     # (k, c) gradient at shared parameters that a fit holds. Further stops are expected to add
     # nothing but noise to it.
     held: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))

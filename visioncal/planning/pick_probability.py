@@ -81,6 +81,10 @@ def pick_jacobian(
         first = size - basis.shape[2] if arm.is_estimated else size
         jacobian[:, :, first : first + basis.shape[2]] = slopes[:, :, count:]
     jacobian[:, :, :count] = slopes[:, :, :count]
+    if recorded is not None and recorded.arm_picks is not None:
+        # Errors of an arm do to the edges, and at look and pick, what the recorded stops show.
+        root = recorded.edge_error_root
+        jacobian[:, :, size : size + root.shape[1]] = jacobian[:, :, :12] @ root
     return jacobian
 
 
@@ -126,9 +130,14 @@ class Picking:
         position of this noise, at observation and pick, and (m, 6) known errors.
         """
         q = self.q[np.linspace(0, len(self.q) - 1, min(40, len(self.q))).astype(np.int64)]
-        sights = []
+        sights = list[tuple[FloatArray, FloatArray, FloatArray | None]]()
         for cell, world in zip(self.cells, self.worlds, strict=True):
             jacobian = pick_jacobian(cell, q, self.recorded, world)
+            known = None if self.recorded is None else self.recorded.arm_picks
+            if known is not None:
+                halves = np.tile(0.5 * known[np.arange(len(q)) % len(known)], (2, 1, 1, 1))
+                sights.append((jacobian, halves, None))
+                continue
             # In the axes of what carries the camera: the flange, or the base.
             levels = cell.noise.robots[0][:, None] ** 2 * np.repeat(np.eye(2), 3, axis=1)
             covariances = np.tile((levels[:, None] * np.eye(6))[:, None], (1, len(q), 1, 1))

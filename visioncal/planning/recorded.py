@@ -10,6 +10,7 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.linalg import covariance_among
 from visioncal.core.number_format import counted
+from visioncal.core.prediction import through
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mount, Progress
 from visioncal.estimation.fit import Fit
@@ -123,24 +124,35 @@ def start_from_session(
     values = run.cell_fit.fit.values(("arm", arm.robot)) if is_missed else None
     recorded = RecordedStops(fit, edges, free, arm.joints_rad, first_corner, errors, values)
     if run.assessment_or_none is not None:
-        recorded = _with_errors(recorded, run.assessment.fit, has_joints=arm.is_modelled)
+        recorded = _with_errors(recorded, run)
     return SessionStart(cell, recorded, refusal, tuple(run.used[at] for at in first.tolist()))
 
 
-def _with_errors(recorded: RecordedStops, fit: Fit, *, has_joints: bool) -> RecordedStops:
+def _with_errors(recorded: RecordedStops, run: RunState) -> RecordedStops:
     """Recorded stops with what a fit holds, and with errors of an arm without joint angles."""
+    fit = run.assessment.fit
     # Gradient at held parameters of lens and boards.
     gradient = fit.equations[1] * (fit.problem.counted & ~fit.unknowns.moved)
     columns = [fit.problem.effect_columns[effect.name] for effect in recorded.fit.problem.effects]
     held = np.concatenate([np.zeros(0), *(gradient[part] for part in columns)])
     recorded = replace(recorded, held=held[:, None])
     by_arm = fit.by_source.get("arm")
-    if has_joints or by_arm is None:
+    if run.robot_arm.is_modelled or by_arm is None:
         return recorded
     index = np.r_[*(fit.problem.edge_columns(frame) for frame in [*recorded.fit.frames][:2])]
     values, vectors = np.linalg.eigh(by_arm[np.ix_(index, index)])
     root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0]
-    return replace(recorded, edge_error_root=root)
+    recorded = replace(recorded, edge_error_root=root)
+    if run.findings is None or not run.findings.picks:
+        return recorded
+    parts = run.findings.picks[0].parts
+    picks = np.sum([parts[name] for name in ("arm", "look", "pick") if name in parts], axis=0)
+    if run.session.mount == "eye-in-hand":
+        turn = np.zeros_like(picks)
+        flanges = next(iter(fit.flanges.values()))[fit.seen.stops, :3, :3]
+        turn[:, :3, :3] = turn[:, 3:, 3:] = flanges.mT
+        picks = through(turn, picks)
+    return replace(recorded, arm_picks=picks)
 
 
 def _of_stops(run: RunState) -> Fit:
