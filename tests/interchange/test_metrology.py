@@ -96,6 +96,16 @@ def cam2(folder):
     return 1, "left out: points.txt", ("faro-vantage", sigma_um), ()
 
 
+def leica(folder):
+    """Rows without names, and uncertainties of 95 %, as Leica's software exports them."""
+    heads = [f"{word}{axis}  [mm]" for word in ("", "U(95) ") for axis in "XYZ"]
+    row = reads([], "0.036", "0.036", "0.024")
+    (folder / "Leica.csv").write_text(joined([heads, *(row(*each) for each in shop().rows)]))
+    (folder / "arm.csv").write_text(joints_table("P{stop}"))
+    sigma_um = np.sqrt((2 * 18**2 + 12**2) / 3)
+    return 1, "k = 2: 0.018, 0.018, 0.012 mm", ("instrument", sigma_um), ("--mount", "instrument")
+
+
 def side_by_side(folder):
     """Three targets in one row, sigma by the user."""
     heads = ["No", *(f"T{point} {axis} [mm]" for point in (1, 2, 3) for axis in "XYZ")]
@@ -119,7 +129,8 @@ def report(folder):
 
 
 @pytest.mark.parametrize(
-    "layout", [report, spatial_analyzer, spatial_analyzer_by_points, polyworks, cam2, side_by_side]
+    "layout",
+    [report, spatial_analyzer, spatial_analyzer_by_points, polyworks, cam2, leica, side_by_side],
 )
 def test_points_of_metrology_programs_are_a_session_of_an_instrument(tmp_path, layout):
     (tmp_path / "in").mkdir()

@@ -64,8 +64,8 @@ _LEVELS = (word_set("collection"), word_set("group gruppe grupo"), word_set(_TAR
 _STOP = word_set("stop pose station posture stelle")
 _LOAD = re.compile(r"(?<![0-9.,])(\d+(?:[.,]\d+)?)[ _]?(kg|N)(?![^\W_])")
 _COVERED = {
-    2.0: re.compile(r"u95|\b95(?:[.,]\d+)? ?%|k ?= ?2\b|2 ?sigma|expanded|erweitert", re.I),
-    3.0: re.compile(r"u99|\b99(?:[.,]\d+)? ?%|k ?= ?3\b|3 ?sigma", re.I),
+    2.0: re.compile(r"u\(?95|\b95(?:[.,]\d+)? ?%|k ?= ?2\b|2 ?sigma|expanded|erweitert", re.I),
+    3.0: re.compile(r"u\(?99|\b99(?:[.,]\d+)? ?%|k ?= ?3\b|3 ?sigma", re.I),
 }
 # Instruments that read no points.
 _OF_AN_AXIS = {"xl80": "XL-80 reads a length", "xr20": "XR20-W reads the angle of one axis"}

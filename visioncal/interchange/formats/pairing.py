@@ -163,7 +163,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     if not ranked:
         raise _unpaired(fields, max(groups, key=lambda group: len(group.files)))
     rivals = [group for group, _ in ranked if rank((group, _)) == rank(ranked[0])]
-    if not all(_are_copies(rivals[0], group) for group in rivals[1:]):
+    if len(rivals) > 1 and not _are_one(rivals, len(fields)):
         raise DataError(
             f"Each row has several images: {some_of([group.listed() for group in rivals])}.",
             culprits=[group.label for group in rivals],
@@ -249,11 +249,12 @@ def _one_over(fields: Fields, group: FileGroup) -> Iterator[Match]:
         yield Match(HOW[3], every if files > rows else np.insert(np.arange(files), left, -1))
 
 
-def _are_copies(one: FileGroup, other: FileGroup) -> bool:
-    """Whether two groups have the same pictures, byte by byte, as in a folder that was copied."""
-    is_equal = len(one.files) == len(other.files)
-    pairs = zip(one.files, other.files, strict=False)
-    return is_equal and all(filecmp.cmp(*pair, shallow=False) for pair in pairs)
+def _are_one(groups: Sequence[FileGroup], count: int) -> bool:
+    """Whether groups have the same pictures, one a row, as in a folder that was copied."""
+    first, *others = groups
+    pairs = (pair for other in others for pair in zip(first.files, other.files, strict=False))
+    is_whole = {len(group.files) for group in groups} == {count}
+    return is_whole and all(filecmp.cmp(*pair, shallow=False) for pair in pairs)
 
 
 def _unpaired(fields: Fields, group: FileGroup) -> UnpairedError:

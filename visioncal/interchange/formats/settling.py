@@ -411,6 +411,9 @@ def _untested(
     for side, free in foreign.unstated.items():
         if "rotation" in free:
             raise _unsaid(foreign, side, why, fault)
+    if foreign.lens == {"model": "points"}:
+        # Places alone test no reading.
+        return foreign
     note = f"The form of the poses stays as first read: {why}."
     note += " Convert with --guess --yes to read them so." if why.startswith("With ") else ""
     return replace(foreign, notes=(*foreign.notes, note))
