@@ -145,8 +145,9 @@ def _with_errors(recorded: RecordedStops, run: RunState) -> RecordedStops:
     recorded = replace(recorded, edge_error_root=root)
     if run.findings is None or not run.findings.picks:
         return recorded
-    parts = run.findings.picks[0].parts
-    picks = np.sum([parts[name] for name in ("arm", "look", "pick") if name in parts], axis=0)
+    first = run.findings.picks[0]
+    # By the arm and its noise alone, not by the calibration and its boards.
+    picks = first.covariances - first.without("arm", "look", "pick").covariances
     if run.session.mount == "eye-in-hand":
         turn = np.zeros_like(picks)
         flanges = next(iter(fit.flanges.values()))[fit.seen.stops, :3, :3]
