@@ -194,7 +194,7 @@ def test_all_faults_are_named_and_the_answer_is_that_of_a_sound_cell():
 def test_a_base_that_was_pushed_is_one_finding(stop):
     cell = simulate(replace(PLAIN, moved=(Moved("base_b", stop),), seed=3))
     found = solved(cell)
-    assert reason(found, f"Between stops {stop - 1} and {stop}, base_b moved by 5.1 mm and 0.5")
+    assert reason(found, f"Between stops {stop - 1} and {stop}, base_b moved by 5.1 mm and 0.57")
     (fault,) = (at for at in found.verdict.findings if at.kind == "something_moved")
     assert sorted(fault.views) == [view.view for view in found.views if not view.used]
     first = min(view.number for view in session_of(cell).views if view.stop == stop)

@@ -40,8 +40,9 @@ def test_information_of_single_stops_adds_up_to_that_of_the_fit(cell):
         # Stops that say nothing of the flange are left out: they are none of these cells'.
         assert np.abs((covariance - fit.estimate.covariance) / scale).max() < 1e-4
         sigmas = np.sqrt(np.diag(covariance))
-        away = (covariance @ total[:p, p] - fit.estimate.values) / sigmas
-        assert away == pytest.approx(np.zeros(p), abs=1e-3)
+        assert covariance @ total[:p, p] == pytest.approx(
+            fit.estimate.values, abs=1e-3 * sigmas.min()
+        )
 
 
 def test_a_process_through_gains_is_its_covariance():
@@ -180,7 +181,7 @@ def test_errors_of_held_boards_are_in_the_covariance_and_not_in_the_estimate():
     moved = log(invert(edges[1.0]) @ edges[1.0 + share])
     exact = solve(with_board(cell, 0.04, 1e-7)).fit.covariance(("edge", "cam"))
     added = sigmas[share] - exact
-    assert np.linalg.norm(moved[3:]) > 2e-5
+    assert np.linalg.norm(moved[3:]) > 3e-5
     assert np.sqrt(added[5, 5]) == pytest.approx(abs(moved[5]), rel=0.1)
 
 

@@ -144,8 +144,5 @@ CLEAR_RATIO = 3.0
 DETERMINED = 0.7
 # Sigmas from which on a stated value counts as contradicted.
 CONTRADICTION = 3.0
-# Two calibrations of a camera, of some twenty views each, differ by about this: corners by a given
-# lens of unstated sigma are off by as much (rms) for its focal lengths, centre and distortion each.
-CALIBRATED_PX = 0.5
 # Greatest blur of an image in which a board is detected, as a Gaussian's sigma [px].
 MAX_BLUR_PX = 4.0

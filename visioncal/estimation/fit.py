@@ -357,12 +357,15 @@ class Fit:
     def shift(self) -> FloatArray:
         """(p,) shift of the unknowns, to first order, if the held ones were estimated as well.
 
-        Its square is the error of holding them, beside their uncertainty, which `by_noise` has.
+        Its square is the error of holding them, beside their uncertainty, which `by_noise` has. The
+        step that is left to those that are estimated, by other noise than the state's, is no part
+        of it: a centre and the camera's turn are so alike that a tenth of a sigma would be ten.
         """
         held = self.problem.counted & ~self.problem.moving
         if not held.any():
             return np.zeros(self.problem.size)
-        return np.asarray(-self.by_noise @ np.where(held, self.equations[1], 0.0))
+        added = self.by_noise - covariance_among(self.fisher, self.problem.moving)
+        return np.asarray(-added @ self.equations[1])
 
     def beside_lasting(self, robot: str, errors: ArmErrors) -> "Fit":
         """The fit with an arm's errors that last in time among the unknowns, before a step.

@@ -51,7 +51,7 @@ def with_held_lenses(fit: Fit) -> Fit:
     for name in fit.unknowns.lenses:
         table = fit.cell.cameras[name]
         if table.stated is not None and table.intrinsics == "hold":
-            given = given_lens(table, name, fit.cell.corners_px(name), is_spare=False)
+            given = given_lens(table, name, np.zeros((0, 2)), is_spare=False)
             lenses += [] if given is None else [given]
     if not lenses:
         return fit
@@ -60,9 +60,7 @@ def with_held_lenses(fit: Fit) -> Fit:
     mixed = mixed_model(fit.cell, unknowns, fit.linearised, grams, fit.used)
     joint, first = mixed.at(fit.estimate.logs, is_sloped=False).covariance, fit.unknowns.count
     slope = np.linalg.solve(joint[first:, first:], joint[first:, :first]).T
-    sigmas = np.concatenate(
-        [np.full(len(prior.columns), prior.sigma) for lens in lenses for prior in lens.priors]
-    )
+    sigmas = np.concatenate([np.full(lens.count, lens.priors[0].sigma) for lens in lenses])
     return fit.considering((slope * sigmas**2) @ slope.T)
 
 
@@ -84,8 +82,7 @@ def with_small_sizes(fit: Fit) -> Fit:
             shown = inner - np.eye(len(at)) / prior.size.low**2
             score = Score(inner @ values[at], (shown + shown.T) / 2, np.inf)
             sizes, gains = score.posterior(prior.size.low, prior.size.high)
-            gains = gains - score.gains(np.array([prior.size.low]))[0]
-            # The least size is as likely as all of these together.
+            # A size of zero is as likely as all of these together.
             weights = np.exp(gains - np.logaddexp.reduce([*gains, np.log(len(gains))]))
             slope = covariance[:, at] @ inner
             for size, weight in zip(sizes.tolist(), weights.tolist(), strict=True):

@@ -258,7 +258,7 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
         if table.stated is None:
             members.append(estimated_lens(name, lens))
         elif table.intrinsics != "hold":
-            given = given_lens(table, name, cell.corners_px(name), is_spare=has_shape)
+            given = given_lens(table, name, _corners_px(cell, name), is_spare=has_shape)
             members += [] if given is None else [given]
     # Errors of an arm without joints follow its posture: they are confounded with a board's size.
     is_sized = all(arm.has_joints for arm in cell.arms.values())
@@ -337,3 +337,10 @@ def _compared(cell: Cell) -> set[str]:
             seers.setdefault(sighting.stop, []).append(sighting.seer)
     stop_counts = Counter(name for names in seers.values() if len(names) > 1 for name in set(names))
     return {name for name, count in stop_counts.items() if count >= ENOUGH_STOPS}
+
+
+def _corners_px(cell: Cell, camera: str) -> FloatArray:
+    """(n, 2) all corners that a camera saw."""
+    return np.concatenate(
+        [s.corners.px for s in cell.sightings if s.seer == camera and s.corners is not None]
+    )

@@ -8,7 +8,6 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.limits import CALIBRATED_PX
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.fit.lens_field import Field, by_lens
@@ -231,10 +230,10 @@ class Unknowns:
 def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool) -> Vector | None:
     """A stated lens, as far as it may be off; None where no sigma is known.
 
-    Focal lengths and centre are off by the stated sigma, if there is one. The rest is off by a
-    maker's prior if the lens is to be refined and `is_spare`, else by a size of focal lengths,
-    centre and distortion each: that of a calibrated lens, or more where `is_spare` corners show it.
-    In units of intrinsics that move (n, 2) corners by one pixel (rms), but where these are stated.
+    Focal lengths and centre are off by the stated sigma, if there is one. Where `is_spare`, (n, 2)
+    corners determine the rest: by a maker's prior if the lens is to be refined, else by a size of
+    focal lengths, centre and distortion each. In units of intrinsics that move the corners by one
+    pixel (rms), but where these are stated.
     """
     lens, stated = table.stated, table.matrix_sigma_px
     if lens is None:
@@ -247,16 +246,15 @@ def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool
         estimated_priors = {prior.columns[0]: prior for prior in estimated_lens(frame, lens).priors}
         priors += [prior for first, prior in estimated_priors.items() if first >= count]
         count = len(values)
-    elif table.intrinsics != "refine":
+    elif is_spare and table.intrinsics == "auto":
         moved = np.sqrt(np.nanmean(by_lens(lens, px) ** 2, axis=(0, 1)) * 2.0)
         parts = {"focal": (0, 2), "centre": (2, 4), "distortion": (4, len(values))}
         for part, (first, last) in parts.items():
             if first >= count:
                 units[first:last] = 1.0 / moved[first:last]
                 name, of = f"{part} {frame}", f"given lens of {frame}"
-                size = Size(name, 1.0, CALIBRATED_PX, 100.0, _ONE_IN_TEN, of)
-                known = Prior(np.arange(first, last), sigma=CALIBRATED_PX)
-                priors.append(Prior(known.columns, size) if is_spare else known)
+                size = Size(name, 1.0, 1e-3, 100.0, _ONE_IN_TEN, of)
+                priors.append(Prior(np.arange(first, last), size))
         count = len(values)
     return Vector(("lens", frame), tuple(priors), values[:count], units[:count]) if count else None
 

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, Mask, Target
+from visioncal.core.types import Mask, Target
 from visioncal.model.arm import Arm, Moments, Swept
 from visioncal.model.sightings import Sighting
 from visioncal.session.document import CameraTable
@@ -63,11 +63,6 @@ class Cell:
                 homes[name] = joined
         groups = {id(group): group for group in homes.values()}.values()
         return tuple(tuple(name for name in self.arms if name in group) for group in groups)
-
-    def corners_px(self, camera: str) -> FloatArray:
-        """(n, 2) all corners that a camera saw."""
-        corner_sets = (one.corners for one in self.sightings if one.seer == camera)
-        return np.concatenate([at.px for at in corner_sets if at is not None])
 
     def with_sightings(self, sightings: Sequence[Sighting]) -> "Cell":
         """The cell with others."""

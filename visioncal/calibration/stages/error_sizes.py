@@ -375,14 +375,11 @@ def _covariance(fit: Fit, camera: str, levels: LensLevels) -> FloatArray:
     """(k, k) covariance of given intrinsics by their sizes; a field displaces by these, too."""
     lens = fit.unknowns.lenses[camera]
     sigmas = np.zeros(len(intrinsics(lens)))
-    table = fit.cell.cameras[camera]
-    if ("lens", camera) in fit.unknowns and table.intrinsics != "refine":
+    if ("lens", camera) in fit.unknowns:
         member = fit.unknowns["lens", camera]
         for prior in member.priors:
-            size = prior.sigma if prior.size is None else fit.sizes[prior.size.name]
-            sigmas[prior.columns] = size * member.units[prior.columns]
-    if table.matrix_sigma_px is not None:
-        sigmas[:4] = 0.0
+            if prior.size is not None:
+                sigmas[prior.columns] = _size(fit, prior.size.name) * member.units[prior.columns]
     field_px = levels.field * _noise_px(fit, camera)
     by_field = field_px * lens_part(lens, levels.length)
     return np.asarray(np.diag(sigmas**2) + by_field @ by_field.T)

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.corner_sizes import smaller_picture
 from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
-from visioncal.core.limits import CALIBRATED_PX, CONTRADICTION
+from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
@@ -104,15 +104,15 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
         )
     if not problem.scene.estimated and has_changed(fitted, columns):
         moves = (fitted.values(lens) - intrinsics(problem.scene.camera))[:4]
-        sigma_px = problem.scene.matrix_sigma_px
+        sigmas_px = problem.stated_sigma[:4]
         moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
         stated, refined = problem.scene.camera, optics.camera(camera)
         moved_px, bent_px = most_moved_px(stated, refined, stack.px)
         if bent_px > max(np.abs(moves).max(), _LEAST_MOVE_PX):
             names = ", ".join(intrinsics_names(stated)[4:])
             moved = f"the distortion, {names}, moved corners by up to {figure(bent_px)} px; {moved}"
-        off_px = moved_px if sigma_px is None else float(np.abs(moves).max())
-        is_wrong = off_px > CONTRADICTION * (sigma_px or CALIBRATED_PX)
+        is_wrong = problem.scene.matrix_sigma_px is None
+        is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * sigmas_px))
         # Beside a board whose size is held, the lens explains residuals by distance.
         is_wrong &= has_changed(assessment.sized, columns)
         if is_wrong and moved_px > _LEAST_MOVE_PX:
@@ -199,8 +199,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
         ]
         sizes, moves = run.cell_fit.sizes, run.cell_fit.inlier_fit.moves
         zoom = sizes.zoomed.get(name)
-        bumped = {at.stop for at in moves if at.frame == name}
-        if zoom is not None and bumped and zoom.station in (None, *bumped):
+        if zoom is not None and any((name, zoom.station) == (at.frame, at.stop) for at in moves):
             # A bump of the camera explains it, which is named.
             continue
         if zoom is not None and zoom.station is None and abs(zoom.share) > _MOST_CREEP:
