@@ -49,6 +49,11 @@ class Relation:
     sigma_m: float  # With rotations on a lever.
     misplaced: Mask | None = None  # (n,) rows that have the robot's pose of a row nearby.
 
+    @property
+    def is_sure(self) -> bool:
+        """Whether views agree on it, and not so few that any would."""
+        return self.sigma_m <= AGREE_M
+
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
@@ -251,11 +256,14 @@ class Network:
                 for relation in relations
                 if joined.component[relation.first] != joined.component[relation.second]
             ]
-            if not options:
-                if not (found := self._found(joined)):
+            if not any(relation.is_sure for relation, _ in options):
+                found = self._found(joined)
+                if not options and not found:
                     return joined, used, by_turn, counts
-                relations += found
-                continue
+                # By what is joined, more views may show a transform than the few of a pair.
+                relations += [one for one in found if one.is_sure or not options]
+                if not options or any(one.is_sure for one in found):
+                    continue
             # Pairs of several transforms come last: others may be reached unambiguously.
             relation, matrices = min(options, key=lambda item: (len(item[1]), item[0].sigma_m))
             first, second, choice = relation.first, relation.second, 0
@@ -322,7 +330,9 @@ class Network:
             if count == 1:
                 fits = [common_transform(candidates, turn) for turn in range(len(turns))]
                 matrices = np.array([matrix for matrix, _ in fits])
-                yield Relation(*unknown[0], matrices, fits[0][1])
+                # A view agrees with itself.
+                sigma_m = fits[0][1] if len(rows) >= FEWEST_VIEWS else np.inf
+                yield Relation(*unknown[0], matrices, sigma_m)
                 return
             if len(rows) < FEWEST_VIEWS:
                 continue

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import permutations
 from typing import TypeVar
 
 import numpy as np
@@ -21,14 +22,15 @@ from visioncal.calibration.stages.observed import CameraObservations, Observed, 
 from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
-from visioncal.core.number_format import figure, ranges
+from visioncal.core.number_format import figure, listed, ranges, view_words
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import Finding, Option, mending
+from visioncal.core.verdict import CALIBRATE, Finding, Option, Remedy, mending
 from visioncal.results import CameraResult
 from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
 from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.document import CameraTable
+from visioncal.session.frames import object_name
 from visioncal.session.kinds import name_of
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
@@ -338,7 +340,31 @@ def locate_targets(seen: T) -> T:
         seen = seen.noting(fit.rejections)
     if not poses:
         raise nothing_seen(seen)
-    return replace(seen, poses=poses)
+    return _with_misnamed(replace(seen, poses=poses))
+
+
+def _with_misnamed(seen: T) -> T:
+    """Notes views that no pose fits by the lens of their camera, and one does by another's."""
+    targets, edits, views = tuple(seen.session.boards.values()), list[str](), list[int]()
+    looks = {frame: look for frame, look in seen.cameras.items() if look.pixel_px is not None}
+    for (frame, look), (other, rival) in permutations(looks.items(), 2):
+        lost = {view: at for view, at in look.corners.items() if view not in seen.poses}
+        if not lost or look.lens is None or rival.lens is None or rival.pixel_px is None:
+            continue
+        lenses = look.lens.camera, rival.lens.camera
+        by_own, by_other = (rms_px(lost, targets, lens) for lens in lenses)
+        fits = (by_other < CLEAR_RATIO * rival.pixel_px) & (CLEAR_RATIO * by_other < by_own)
+        if found := [view for view, is_of_other in zip(lost, fits, strict=True) if is_of_other]:
+            names = [object_name(name, "cam") for name in (other, frame)]
+            edits.append(f"{' for '.join(names)} in column camera of {view_words(found)}")
+            views += found
+    if not views:
+        return seen
+    words = f"{view_words(sorted(views))} fit a pose of their target by the lens of another camera "
+    words += "alone: these rows have its name exchanged for that of their own."
+    do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
+    words = f"{words[0].upper()}{words[1:]}"
+    return seen.noting((), (Finding("misnamed_rows", words, do, tuple(sorted(views))),))
 
 
 def _other_lens(

@@ -1,7 +1,7 @@
 """Search for other stops that outliers fit, and for rows that are exchanged."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -77,12 +77,17 @@ def _at_stops(
 
 
 def other_names(
-    problem: Problem, fit: Solution, out: IntArray, moves: Sequence[Move]
+    problem: Problem,
+    fit: Solution,
+    out: IntArray,
+    moves: Sequence[Move],
+    seen_by: Callable[[int, str], FloatArray],
 ) -> dict[int, tuple[str, str]]:
     """Frames `(observer, observed)` that outliers fit at their own stop, one of both another one.
 
     A lens or a board that is not the named one leaves a pose that is off by much more than noise,
-    and by far less than another place. Arguments as of `other_stops`.
+    and by far less than another place. Arguments as of `other_stops`, and (4, 4) what an
+    observation is by the lens of an observer.
     """
     seen, found = problem.observations, dict[int, tuple[str, str]]()
     frames = {*problem.tree.branches, problem.tree.root}
@@ -100,7 +105,10 @@ def other_names(
         pairs = [*dict.fromkeys(pairs)]
         repeated = np.full(len(pairs), at)
         observers, observed = zip(*pairs, strict=True)
-        named = replace(seen.take(repeated), observers=observers, observed=observed)
+        measured = np.array([seen_by(at, observer) for observer in observers])
+        named = replace(
+            seen.take(repeated), observers=observers, observed=observed, measured=measured
+        )
         for move in moves:
             named = named.renamed(move.frame, move.twin, named.stops >= move.stop)
         effects = tuple(effect.take(repeated) for effect in problem.effects)

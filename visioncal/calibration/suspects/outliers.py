@@ -2,6 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import chain, pairwise
 
 import numpy as np
@@ -24,14 +25,17 @@ from visioncal.calibration.suspects.moved_views import (
     pushed_base,
     turned_back,
 )
+from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import counted, figure, listed, ranges, some_of, view_words
 from visioncal.core.transforms import distances, invert, pose_difference
-from visioncal.core.types import IntArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Option, Remedy, mending
+from visioncal.estimation.unknowns import LENS
 from visioncal.results import CONTRADICTS, Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import object_name
+from visioncal.vision.pnp import measure_poses
 from visioncal.vision.targets import half_turn_of, rotation_transforms
 
 # Kinds of findings, which others name.
@@ -146,7 +150,20 @@ def _turned(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
 def _misnamed(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
     """Outliers that fit where their camera or their target has the name of another one."""
     inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
-    found = other_names(inliers.problem, inliers.fit, outliers, inliers.moves)
+    targets, lenses = tuple(cell_fit.cell.session.boards.values()), cell_fit.fit.unknowns.of(LENS)
+
+    def seen_by(at: int, observer: str) -> FloatArray:
+        """The pose (4, 4) of a row's target by the lens of an observer."""
+        corners = cell_fit.poses[at].corners
+        if observer != rows[at].seer and observer in lenses and corners is not None:
+            # Where the other lens has no ray, the pose is that by the stated one.
+            with suppress(VisioncalError):
+                lens = cell_fit.fit.camera(observer)
+                (view,) = measure_poses({corners.view: corners}, targets, lens, 1.0)
+                return np.asarray(view.cam_from_target[0])
+        return np.asarray(inliers.problem.observations.measured[at])
+
+    found = other_names(inliers.problem, inliers.fit, outliers, inliers.moves, seen_by)
     by_names = defaultdict[tuple[str, str], list[int]](list)
     for at, names in found.items():
         frames = rows[at].seer, rows[at].seen
@@ -199,11 +216,13 @@ def _of_other_robots(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFaul
 
 
 def _of_other_images(cell_fit: CellFit, outliers: IntArray) -> Iterator[PoseFault]:
-    """Outliers of one camera whose images are some stops apart, whatever moves before it."""
+    """Outliers of one camera whose images are some stops apart, of boards with two arms between."""
     inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
-    by_camera = defaultdict[str, list[int]](list)
+    by_camera, tree = defaultdict[str, list[int]](list), cell_fit.cell.tree
     for at in outliers.tolist():
-        by_camera[rows[at].seer].append(at)
+        # Of one arm, pairs alone show whether its poses are apart or images.
+        if sum(bool(step.robot) for step in tree.path(rows[at].seer, rows[at].seen)) > 1:
+            by_camera[rows[at].seer].append(at)
     for camera, some in by_camera.items():
         by, found = shifted_images(inliers.problem, inliers.fit, np.array(some), inliers.moves)
         if len(found) < FEWEST_VIEWS:
