@@ -127,7 +127,7 @@ def main() -> None:
             if error.errno not in _REFUSED:
                 raise
             words, step = _REFUSED[error.errno]
-            _refuse(DataError(f"{error.filename} {words}.", next_step=step))
+            _refuse(DataError(f"{error.filename or 'A file'} {words}.", next_step=step))
 
 
 def _refuse(error: VisioncalError) -> None:

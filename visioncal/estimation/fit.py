@@ -354,18 +354,25 @@ class Fit:
         return np.asarray(sum(self.by_source.values(), self.by_noise))
 
     @cached_property
+    def held_gradient(self) -> FloatArray:
+        """(p,) half the gradient of the squared error at held unknowns, beside the others' optimum.
+
+        The step that is left to those that are estimated, by other noise than the state's, is taken
+        first: a centre and the camera's turn are so alike that a tenth of a sigma would be ten.
+        """
+        held, gradient = self.problem.counted & ~self.problem.moving, self.equations[1]
+        step = covariance_among(self.fisher, self.problem.moving) @ gradient
+        return np.where(held, gradient - self.fisher @ step, 0.0)
+
+    @cached_property
     def shift(self) -> FloatArray:
         """(p,) shift of the unknowns, to first order, if the held ones were estimated as well.
 
-        Its square is the error of holding them, beside their uncertainty, which `by_noise` has. The
-        step that is left to those that are estimated, by other noise than the state's, is no part
-        of it: a centre and the camera's turn are so alike that a tenth of a sigma would be ten.
+        Its square is the error of holding them, beside their uncertainty, which `by_noise` has.
         """
-        held = self.problem.counted & ~self.problem.moving
-        if not held.any():
+        if not (self.problem.counted & ~self.problem.moving).any():
             return np.zeros(self.problem.size)
-        added = self.by_noise - covariance_among(self.fisher, self.problem.moving)
-        return np.asarray(-added @ self.equations[1])
+        return np.asarray(-self.by_noise @ self.held_gradient)
 
     def beside_lasting(self, robot: str, errors: ArmErrors) -> "Fit":
         """The fit with an arm's errors that last in time among the unknowns, before a step.

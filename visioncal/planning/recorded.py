@@ -131,10 +131,8 @@ def start_from_session(
 def _with_errors(recorded: RecordedStops, run: RunState) -> RecordedStops:
     """Recorded stops with what a fit holds, and with errors of an arm without joint angles."""
     fit = run.assessment.fit
-    # Gradient at held parameters of lens and boards.
-    gradient = fit.equations[1] * (fit.problem.counted & ~fit.unknowns.moved)
     columns = [fit.problem.effect_columns[effect.name] for effect in recorded.fit.problem.effects]
-    held = np.concatenate([np.zeros(0), *(gradient[part] for part in columns)])
+    held = np.concatenate([np.zeros(0), *(fit.held_gradient[part] for part in columns)])
     recorded = replace(recorded, held=held[:, None])
     by_arm = fit.by_source.get("arm")
     if run.robot_arm.is_modelled or by_arm is None:
