@@ -24,8 +24,7 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.documents.pendants import pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
-from visioncal.interchange.formats.foreign import ImportOptions
-from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.touches import read_touches
 from visioncal.present.recording.notes import verdict_markdown
 from visioncal.results import Calibration, RobotResult, to_document
@@ -161,8 +160,16 @@ def test_lines_in_degrees_by_their_names_may_be_in_radians(cell, unit, tmp_path)
     (tmp_path / "log.txt").write_text("\n".join(lines))
     rows = read_touches(tmp_path / "log.txt", ImportOptions())
     assert np.abs(rows.base_from_flange - poses_of(cell)).max() < 1e-8
-    notes = " ".join(read_fields(tmp_path / "log.txt").notes)
+    notes = " ".join(rows.notes)
     assert ("they are taken for radians" in notes) == (not unit)
+    # A form that is stated says its unit.
+    stated = ImportOptions(robot=PoseImportOptions(form="kuka"))
+    rows = read_touches(tmp_path / "log.txt", stated)
+    turns = rows.base_from_flange[:, :3, :3]
+    assert (np.abs(turns - np.eye(3)).max() < 0.2) == (not unit)
+    assert not rows.notes
+    said = visioncal("tcp", tmp_path / "log.txt", "-o", tmp_path / "tool.json").err
+    assert ("say --robot-form kuka" in said) == (not unit)
 
 
 def test_names_of_columns_say_whose_poses_they_are_once_their_turns_are_found(cell, tmp_path):

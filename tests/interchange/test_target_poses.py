@@ -22,6 +22,7 @@ from visioncal.calibration.guess.search import turns_alike
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import rereading
+from visioncal.interchange.formats.documents import read_document
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.poses import possible_poses
 from visioncal.interchange.formats.reading import read_fields
@@ -297,6 +298,86 @@ def test_of_many_links_the_one_that_turns_as_the_board_is_taken(tmp_path, away_d
         found = Session.load(tmp_path / "out").views
         for view, pose in zip(found, poses, strict=True):
             np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
+
+
+@pytest.mark.parametrize("names", [("robot", "tool"), ("left", "right")])
+def test_the_fields_that_agree_best_are_named_in_a_command_as_typed(tmp_path, names):
+    """Where letters of their names are in the options and in the folder, too."""
+    poses, seen = turning(12)
+    rng = np.random.default_rng(3)
+    away = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(3.0), (12, 3))).as_matrix()
+    closest = poses.copy()
+    closest[:, :3, :3] = poses[:, :3, :3] @ away
+    links = zip(names, (poses[rng.permutation(12)], closest), strict=True)
+    sides = {
+        name: np.hstack([link[:, :3, 3], Rotation.from_matrix(link[:, :3, :3]).as_quat()])
+        for name, link in links
+    }
+    rows = [
+        {"corners": px.tolist()} | {name: rows[at].tolist() for name, rows in sides.items()}
+        for at, px in enumerate(corners_px(seen))
+    ]
+    write(tmp_path / "in.json", rows)
+    typed = ["convert", tmp_path / "in.json", tmp_path / f"out of {names[0]}"]
+    typed += ["--mount", "eye-in-hand", "--target", "checkerboard_13x10_15mm"]
+    typed += ["--resolution", "640,400"]
+    said = visioncal(*typed).refused("Which of these are the robot's poses").err
+    command = shlex.split(said.splitlines()[-1])
+    assert command[1 : 1 + len(typed)] == [*map(str, typed)]
+    options = command[1 + len(typed) :]
+    given = dict(zip(options[::2], options[1::2], strict=True))
+    assert given.pop("--robot-key") == names[1]
+    assert given in ({}, {"--camera-key": names[0]})
+
+
+def test_extrinsic_parameters_of_opencv_are_vectors_alone(tmp_path):
+    seen = world()[1]
+    place, turn = halves(seen)
+    lens = listed("camera_matrix", np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]]))
+
+    def read(**arrays):
+        rows = "".join(listed(name, array) for name, array in arrays.items())
+        write(tmp_path / "lens.yml", f"%YAML:1.0\n---\n{lens}{rows}")
+        document = read_document(tmp_path / "lens.yml")
+        names = ("board_to_camera_rvecs", "board_to_camera_tvecs")
+        return [document.get(f"extrinsic_parameters.{name}") for name in names]
+
+    for given in (
+        {"extrinsic_parameters": np.hstack([turn, place])},
+        {"rotation_vectors": turn, "translation_vectors": place},
+        {"rotation_vectors": turn.T, "translation_vectors": place.T},
+    ):
+        np.testing.assert_array_equal(read(**given), [turn, place])
+    matrices = seen[:, :3, :3].reshape(-1, 9)
+    for other in (
+        {"extrinsic_parameters": np.hstack([matrices, place])},
+        {"extrinsic_parameters": seen[0, :3]},
+        {"rotation_vectors": matrices, "translation_vectors": place},
+        {"rotation_vectors": turn, "translation_vectors": place[1:]},
+    ):
+        assert read(**other) == [None, None]
+
+
+@pytest.mark.parametrize("letters", ["xyzw", "wxyz"])
+def test_a_heading_names_all_numbers_below_it(tmp_path, letters):
+    poses, _, _ = world()
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    text = ""
+    for at, (place, turn) in enumerate(zip(poses[:, :3, 3], quaternions, strict=True)):
+        named = dict(zip("xyzw", turn.tolist(), strict=True))
+        parts = {"grip_place": zip("xyz", place.tolist(), strict=True)}
+        parts["grip_turn"] = [(name, named[name]) for name in letters]
+        text += f"image{at}.png\n"
+        for heading, numbers_of in parts.items():
+            text += f"{heading}:\n" + "".join(f"{name}: {n!r}\n" for name, n in numbers_of)
+        write(tmp_path / f"in/image{at}.png", "")
+        cv2.imwrite(str(tmp_path / f"in/image{at}.png"), np.full((40, 60), at, np.uint8))
+    write(tmp_path / "in/log.txt", text)
+    said = ("--mount", "eye-in-hand", "--robot-key", "grip_place,grip_turn", "--target")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said, "checkerboard_9x6_25mm")
+    done.good()
+    found = [view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "out").views]
+    np.testing.assert_allclose(found, poses, atol=1e-9)
 
 
 def test_rotations_stand_first_in_rows_of_which_some_are_missing(tmp_path):

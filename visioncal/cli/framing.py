@@ -22,7 +22,7 @@ from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.frames.tcp import touched_tool
-from visioncal.frames.touches import NO_TOOL, Tool
+from visioncal.frames.touches import NO_TOOL, Tool, TouchRows
 from visioncal.interchange.formats.touches import (
     is_session,
     read_nominal,
@@ -280,6 +280,7 @@ def tcp_command(options: TcpOptions) -> None:
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
         rows = read_touches(source, import_options(options, calibration), options.robot)
+        _say_notes(rows)
         model, noise_m = _model(options), options.noise_m
         return touched_tool(rows, calibration, model, touch_noise_m=noise_m)
 
@@ -306,9 +307,15 @@ def fixture_command(options: FixtureOptions) -> None:
             )
         tool = _tool(options.tool, calibration, robot)
         rows = read_touches(source, reading_options, robot, positions=tool is None)
+        _say_notes(rows)
         return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
 
     place_frame("fixture", options, by_touches, options.cad, options.tool)
+
+
+def _say_notes(rows: TouchRows) -> None:
+    for note in rows.notes:
+        say(f"note: {note}")
 
 
 def _model(options: FrameOptions) -> Robot | None:

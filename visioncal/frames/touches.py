@@ -42,6 +42,7 @@ class TouchRows:
     points: tuple[str, ...]  # (n,) names of the touched points; empty where not stated.
     # The poses as they are written in a table, which may be meant otherwise.
     numbers: PoseNumbers | None = None
+    notes: tuple[str, ...] = ()  # Assumptions, in sentences for the user.
 
     def __len__(self) -> int:
         return len(self.labels)

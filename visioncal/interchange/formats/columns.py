@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     faults: list[tuple[int, DataError]] = []
     readings = _proposed(source, requested)
     instead = image_groups(requested.images) if requested.images else None
+    proposing = partial(unknown, source, requested, [each for _, each, _ in readings[:1]])
     for rank, fields, options in readings:
         try:
             for more, foreign in _recordings(fields, options, images, instead):
@@ -96,7 +98,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
                 all_notes += series_note(fields, other_fields)
                 lens_of = foreign.lens or lens
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
-                found.append((rank + more, whole))
+                found.append((rank + more, replace(whole, proposing=proposing)))
         except DataError as error:
             faults.append((rank, error))
     # A recording's fault is said, and no result beside it taken instead.
@@ -109,9 +111,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         robot, camera = apart
         return _read(robot, replace(requested, camera_file=camera))
     if not is_clear:
-        first = replace(
-            first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
-        )
+        first = replace(first, doubt=proposing(()))
     return replace(first, rivals=tuple((at - rank, other) for at, other in others))
 
 

@@ -22,6 +22,7 @@ from visioncal.core.documents.toml import check_values, parse_toml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
+from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     MOST_NUMBERS,
     POSE_SIZES,
@@ -145,12 +146,24 @@ def _with_extrinsics(document: object) -> object:
     halves = [called.get(f"{half}_vectors", "") for half in ("rotation", "translation")]
     keys = halves if all(halves) else [called.get("extrinsic_parameters", "")]
     with suppress(KeyError, ValueError, TypeError):
-        extrinsics = np.hstack([np.array(document[key], dtype=float) for key in keys])
+        arrays = [np.array(document[key], dtype=float) for key in keys]
+        extrinsics = np.hstack([*map(_vectors, arrays)] if all(halves) else arrays)
+        if extrinsics.ndim != 2 or extrinsics.shape[1] != 6:
+            return document
+        turns, places = np.split(extrinsics, 2, axis=1)
         rest = {name: value for name, value in document.items() if name not in keys}
-        turns, places = extrinsics.reshape(-1, 2, 3).swapaxes(0, 1)
         found = {"board_to_camera_rvecs": [*turns], "board_to_camera_tvecs": [*places]}
         return {**rest, **{f"extrinsic_parameters.{name}": rows for name, rows in found.items()}}
     return document
+
+
+def _vectors(array: FloatArray) -> FloatArray:
+    """(n, 3) vectors of n views from rows, or of other than three from columns; or ValueError."""
+    if array.ndim == 2 and len(array) == 3 != array.shape[1]:
+        array = array.T
+    if array.shape[1:] not in ((3,), (1, 3), (3, 1)):
+        raise ValueError(f"no vectors: {array.shape}")
+    return array.reshape(-1, 3)
 
 
 def _by_view(array: Array) -> Array:

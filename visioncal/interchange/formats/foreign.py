@@ -1,6 +1,6 @@
 """A foreign recording as its numbers are written, its format, and the user's options for it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias
@@ -148,6 +148,8 @@ class ForeignRecording:
     rivals: tuple[tuple[int, "ForeignRecording"], ...] = ()
     doubt: DataError | None = None  # The error where nothing decides between these.
     fields: tuple[str, ...] = ()  # Those of the robot's poses.
+    # The same error with the fields that it shall propose.
+    proposing: Callable[[Sequence[str]], DataError] | None = None
     title: str = ""  # The session's name, where it is not that of the source.
 
 

@@ -4,7 +4,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TypeAlias
 
@@ -108,7 +108,8 @@ def _pictured(stop: _Lines) -> str:
 def arrays_in(lines: _Lines) -> dict[str, FloatArray]:
     """The numbers of lines by name: their own, or that of the heading above, of two and more.
 
-    Numbers of one letter, as of a quaternion, keep it below their heading: `rotation.w`.
+    Numbers of one letter, as of a quaternion, keep it below their heading, `rotation.w`, which has
+    all of them in the order x, y, z, w.
     """
     arrays, heading = defaultdict[str, list[float]](list), "matrix"
     entries = [(*_numbers_in(line), line) for _, line in lines]
@@ -127,11 +128,16 @@ def arrays_in(lines: _Lines) -> dict[str, FloatArray]:
         is_whole = len(numbers) in POSE_SIZES or (named != "matrix" and "[" in line)
         is_again = is_whole and len(numbers) == len(arrays[named])
         arrays[named] = numbers if is_again else arrays[named] + numbers
-    parts = {f"{top}.{name}" for top in headed for name in _PARTS}
-    return {
-        name: np.array(row[0] if name in parts and len(row) == 1 else row)
-        for name, row in arrays.items()
-        if row
+    parts = {top: [f"{top}.{name}" for name in _PARTS] for top in dict.fromkeys(above)}
+    single = {name for name in chain(*parts.values()) if len(arrays.get(name, ())) == 1}
+    # Joined, too, as those of a mapping.
+    joined = {
+        top: np.array([arrays[name][0] for name in of_top if name in single])
+        for top, of_top in parts.items()
+        if len(single.intersection(of_top)) > 2
+    }
+    return joined | {
+        name: np.array(row[0] if name in single else row) for name, row in arrays.items() if row
     }
 
 
@@ -300,16 +306,20 @@ def pendant_poses(text: str, path: Path, form: str | None) -> Fields | None:
 def _poses_of(lines: _Lines, form: str | None) -> tuple[list[PendantPose], tuple[str, ...]]:
     """The poses of lines in a maker's notation, and a note where their angles are in radians.
 
-    Degrees of all poses within pi would leave each flange upright, and turn it by a few degrees.
+    Degrees of all poses within pi would leave each flange upright, and turn it by a few degrees. A
+    form that is stated says its unit.
     """
     written = [(IMAGE.sub(" ", line), place) for place, line in lines]
     poses = [read_pose(line, place, form) for line, place in written]
-    in_degrees = all(pose.reading.rotation.startswith("euler") for pose in poses)
+    in_degrees = not form and all(pose.reading.rotation.startswith("euler") for pose in poses)
     angles = np.array([write_pose(pose.pose, pose.form)[3:] for pose in poses if in_degrees])
     if len(angles) < FEWEST_VIEWS or not 1.0 < np.abs(angles).max() < 1.001 * np.pi:
         return poses, ()
     turned = [read_pose(line, place, form, angle="rad") for line, place in written]
     # A unit that is written remains.
     is_same = turned[0].reading == poses[0].reading
-    note = f"No angle is over {np.abs(angles).max():.4g}: they are taken for radians."
+    note = (
+        f"No angle is over {np.abs(angles).max():.4g}: they are taken for radians. Where they are "
+    )
+    note += f"degrees, say --robot-form {poses[0].form.name}."
     return turned, () if is_same else (note,)

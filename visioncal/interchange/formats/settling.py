@@ -257,11 +257,10 @@ def _tested(
 
 def _with_fields(foreign: ForeignRecording, closest: ForeignRecording | None) -> DataError | None:
     """The doubt of a recording, with the fields of the reading that agrees best proposed."""
-    doubt, first = foreign.doubt, ",".join(foreign.fields)
-    if doubt is None or closest is None or first not in doubt.next_step or not first:
-        return doubt
-    step = doubt.next_step.replace(first, ",".join(closest.fields))
-    return DataError(doubt.message, culprits=doubt.culprits, next_step=step)
+    is_open = foreign.doubt is not None and not isinstance(foreign.doubt, UnpairedError)
+    if not is_open or foreign.proposing is None or closest is None or not closest.fields:
+        return foreign.doubt
+    return foreign.proposing(closest.fields)
 
 
 def _are_same(first: ForeignRecording, second: ForeignRecording) -> bool:

@@ -362,8 +362,13 @@ def _has(fields: Fields, given: Sequence[str]) -> bool:
     return all(any(f".{name}.".find(f".{each}.") >= 0 for name in names) for each in given)
 
 
-def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
-    """The error of a source whose poses are not known, with a command that reads it."""
+def unknown(
+    source: Source,
+    requested: ImportOptions,
+    rows: Sequence[Fields] = (),
+    likely: Sequence[str] = (),
+) -> DataError:
+    """The error of poses that are not known, with a command; of the `likely` fields, if it may."""
     enough = [each for each in rows if len(each) >= FEWEST_ROWS or source.longest < FEWEST_ROWS]
     possible = [
         (fields, item)
@@ -372,6 +377,7 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
     ]
     possible.sort(
         key=lambda of: (
+            of[1].names != likely or of[1].is_of_target,
             of[1].is_seen,
             of[1].sides != ["robot"],
             bool(of[1].sides),

@@ -72,7 +72,8 @@ def read_touches(
     texts = {name.lower(): cells for name, cells in fields.texts.items()}
     kinds, points = (texts.get(name, ("",) * len(fields)) for name in ("kind", "point"))
     labels = tuple(map(str, numbers))
-    return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points, written)
+    places, notes = fields.places, fields.notes
+    return TouchRows(path.name, labels, places, poses, joints_rad, kinds, points, written, notes)
 
 
 def is_session(path: Path) -> bool:
