@@ -711,14 +711,13 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
 
 
 def test_poses_are_left_handed_where_markers_show_that_images_are_not_mirrored(tmp_path):
-    cell, mirror = simulate(CellOptions(views=14, seed=3)), np.diag([1.0, -1.0, 1.0, 1.0])
-    Session.from_corners(
-        [(seen.ids, seen.px) for seen in cell.corners],
-        mirror @ cell.robot.base_from_flange @ mirror,
-        replace(cell.options.target, square_sigma_m=1e-7),
-        cell.stated[""].resolution,
-        mount="eye-in-hand",
-    ).save(tmp_path / "cell")
+    cell = simulate(CellOptions(views=14, seed=3))
+    write_session(cell, tmp_path / "cell")
+    # In a frame whose y points the other way.
+    turned = [POSE[at] for at in (1, 3, 5)]
+    rewritten(
+        tmp_path / "cell", lambda _, row: row | {name: repr(-float(row[name])) for name in turned}
+    )
     done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
     assert "With the robot's poses in a left-handed frame" in done.said
     assert "images mirrored" not in done.said
@@ -727,6 +726,29 @@ def test_poses_are_left_handed_where_markers_show_that_images_are_not_mirrored(t
     typed("convert", tmp_path / "cell", tmp_path / "mended", "--mend-images").refused("mirrored")
     converted(tmp_path / "cell", tmp_path / "fixed", "--yes", "--mirror-poses").good()
     assert visioncal.calibrate(tmp_path / "fixed").verdict.status == "good"
+
+
+def test_corner_numbers_of_another_program_are_no_proof_that_images_are_not_mirrored(tmp_path):
+    """Pictures and numbers are mirrored, so that the board seems seen from its front."""
+    cell = simulate(CellOptions(views=14, seed=3))
+    (width, _), inner = cell.stated[""].resolution, cell.options.target.columns - 1
+    corners = []
+    for seen in cell.corners:
+        ids = seen.ids // inner * inner + inner - 1 - seen.ids % inner
+        px, order = np.abs([width - 1.0, 0.0] - seen.px), np.argsort(ids)
+        corners.append((ids[order], px[order]))
+    Session.from_corners(
+        corners,
+        cell.robot.base_from_flange,
+        replace(cell.options.target, square_sigma_m=1e-7),
+        cell.stated[""].resolution,
+        mount="eye-in-hand",
+    ).save(tmp_path / "cell")
+    done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
+    assert "images mirrored, or the robot's poses in a left-handed frame" in done.said
+    assert "Look at an image first" in done.said
+    assert not any("--guess" in command for command in printed_commands(done.said))
+    typed("convert", tmp_path / "cell", tmp_path / "mended", "--mend-images").good()
 
 
 def test_an_unknown_robot_is_named_with_the_correction(cell):

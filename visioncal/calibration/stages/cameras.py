@@ -256,7 +256,9 @@ def shows_print(seen: Observed) -> bool:
     session, corners = seen.session, seen.corners
     views = [view for view in session.views if view.number in corners]
     pairs = [(corners[view.number], session.boards[session.board_of(view)]) for view in views]
-    has_markers = all(target.dictionary and not target.is_rig for _, target in pairs)
+    # Another program's corner numbers are no markers that were seen.
+    are_detected = all(view.image and not view.has_corners for view in views)
+    has_markers = are_detected and all(at.dictionary and not at.is_rig for _, at in pairs)
     return bool(pairs) and has_markers and not are_from_behind(pairs)
 
 
@@ -360,8 +362,11 @@ def _with_misnamed(seen: T) -> T:
             views += found
     if not views:
         return seen
-    words = f"{view_words(sorted(views))} fit a pose of their target by the lens of another camera "
-    words += "alone: these rows have its name exchanged for that of their own."
+    fit, rows, its = "fits a", "this row has", "its"
+    if len(views) > 1:
+        fit, rows, its = "fit a", "these rows have", "their"
+    words = f"{view_words(sorted(views))} {fit} pose of {its} target by the lens of another camera "
+    words += f"alone: {rows} the name of that camera in place of {its} own."
     do = Remedy(f"In views.csv, write {listed(edits)}, and calibrate again.", CALIBRATE)
     words = f"{words[0].upper()}{words[1:]}"
     return seen.noting((), (Finding("misnamed_rows", words, do, tuple(sorted(views))),))

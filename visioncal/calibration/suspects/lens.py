@@ -199,8 +199,9 @@ def _beyond(run: RunState) -> Iterator[Finding]:
         ]
         sizes, moves = run.cell_fit.sizes, run.cell_fit.inlier_fit.moves
         zoom = sizes.zoomed.get(name)
-        if zoom is not None and any((name, zoom.station) == (at.frame, at.stop) for at in moves):
-            # A bump of the camera explains it, which is named.
+        bumped = {at.stop for at in moves if at.frame == name}
+        if zoom is not None and bumped and zoom.station in (None, *bumped):
+            # A bump of the camera, which is named, explains it: as a change there, or as a creep.
             continue
         if zoom is not None and zoom.station is None and abs(zoom.share) > _MOST_CREEP:
             continue

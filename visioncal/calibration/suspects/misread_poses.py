@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,11 +33,11 @@ from visioncal.calibration.suspects.mistaken_rows import Undoing
 from visioncal.calibration.suspects.moved_views import IN_MOTION
 from visioncal.calibration.suspects.other_rows import of_other_rows
 from visioncal.calibration.suspects.pairs_alone import of_all_rows
-from visioncal.calibration.suspects.record import StopOfRobot
+from visioncal.calibration.suspects.record import Edges, Record, StopOfRobot, evidence
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
-from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import figure, robot_words, view_words
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray
@@ -180,20 +180,40 @@ def with_undone(run: RunState) -> RunState:
 
 
 def _with_rest_of_log(run: RunState, robot: str, found: Finding) -> Finding:
-    """A finding on repeated poses of a robot with its other rows that repeat these, too."""
+    """A finding on repeated poses of a robot with its rows that repeat these without a gap, too."""
     if found.kind != "copied_poses":
         return found
     poses, stops = run.robots[robot].base_from_flange, stops_by_view(run.session)
-    more = set[int]()
-    for view in found.views:
-        alike = [at for at, pose in poses.items() if np.array_equal(pose, poses[view])]
-        first = min(stops[at] for at in alike)
-        more |= {at for at in alike if stops[at] > first}
-    rest = sorted(more.difference(found.views))
+    # Stops with the pose of the one before, by each time that the robot, or its log, stood still.
+    stills: list[dict[int, FloatArray]] = [{}]
+    for (_, before), (stop, at) in pairwise(_stops_of(run, robot).items()):
+        if np.array_equal(before.pose, at.pose):
+            stills[-1][stop] = at.pose
+        else:
+            stills.append({})
+    named = {stops[view] for view in found.views}
+    stuck = {stop: pose for still in stills if named & {*still} for stop, pose in still.items()}
+    among = {view: pose for view, pose in poses.items() if stops[view] in stuck}
+    alike = {view for view, pose in among.items() if np.array_equal(pose, stuck[stops[view]])}
+    rest = sorted(alike - {*found.views} - _agreeing(run, robot))
     if not rest:
         return found
     words = f"{found.words} So {'do' if len(rest) > 1 else 'does'} {view_words(rest)}."
     return replace(found, words=words, views=tuple(sorted((*found.views, *rest))))
+
+
+def _agreeing(run: RunState, robot: str) -> set[int]:
+    """Views of a robot of a cell that agree with the others of their camera and target."""
+    found = set[int]()
+    for pair in pairs_of(run, robot):
+        record = Record.of(of_pair(run, robot, pair))
+        paired = record.paired(np.arange(len(record.views)))
+        is_enough = len(record.rows) >= FEWEST_COMPARED
+        edges = Edges.by(record, paired, ~record.copies) if is_enough else None
+        if edges is not None:
+            ((agrees,),) = evidence(edges.of(paired)[None])[1:]
+            found |= {*record.views[record.rows[agrees]].tolist()}
+    return found
 
 
 def _is_of_images(
