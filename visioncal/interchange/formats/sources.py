@@ -421,7 +421,7 @@ def unknown(
         word = named_by(rows[0].places[0])
         step = f"Name them with --robot-{word}, or the joint angles with --joint-{word}."
     return DataError(
-        f"{source.words()}\nWhich of these are the robot's poses is not known.",
+        f"{source.words()}\nAny of these may be the robot's poses.",
         culprits=[str(source.path)],
         next_step=step
         or next((part.fault.next_step for part in source.parts if part.fault), "")
