@@ -677,17 +677,23 @@ def converted(source, dest, *more):
     return typed("convert", source, dest, "--guess", *more)
 
 
-@pytest.mark.slow
-def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
-    cell = simulate(CellOptions(views=18, seed=3))
-    width = cell.stated[""].resolution[0]
+def save_corners(cell, corners, folder):
+    """Saves a session of the poses of a cell, a camera in hand, beside other corners."""
     Session.from_corners(
-        [(seen.ids, seen.px * [-1, 1] + [width - 1, 0]) for seen in cell.corners],
+        corners,
         cell.robot.base_from_flange,
         replace(cell.options.target, square_sigma_m=1e-7),
         cell.stated[""].resolution,
         mount="eye-in-hand",
-    ).save(tmp_path / "cell")
+    ).save(folder)
+
+
+@pytest.mark.slow
+def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
+    cell = simulate(CellOptions(views=18, seed=3))
+    width = cell.stated[""].resolution[0]
+    mirrored = [(seen.ids, seen.px * [-1, 1] + [width - 1, 0]) for seen in cell.corners]
+    save_corners(cell, mirrored, tmp_path / "cell")
     done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
     # Mirrored images fit as well, and no reading of the poses helps these.
     assert "Look at an image first: where it is mirrored" in done.said
@@ -737,13 +743,7 @@ def test_corner_numbers_of_another_program_are_no_proof_that_images_are_not_mirr
         ids = seen.ids // inner * inner + inner - 1 - seen.ids % inner
         px, order = np.abs([width - 1.0, 0.0] - seen.px), np.argsort(ids)
         corners.append((ids[order], px[order]))
-    Session.from_corners(
-        corners,
-        cell.robot.base_from_flange,
-        replace(cell.options.target, square_sigma_m=1e-7),
-        cell.stated[""].resolution,
-        mount="eye-in-hand",
-    ).save(tmp_path / "cell")
+    save_corners(cell, corners, tmp_path / "cell")
     done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
     assert "images mirrored, or the robot's poses in a left-handed frame" in done.said
     assert "Look at an image first" in done.said

@@ -14,6 +14,8 @@ from visioncal.core.types import MOUNTS, FloatArray, IntArray, Mount
 
 # Mirroring another axis is equivalent, up to half turns of both frames.
 _MIRROR = np.array([1.0, -1.0, 1.0])
+# Part of the words of mirrored poses, which markers in images disprove.
+OR_IMAGES = "the images mirrored, or "
 # Units of poses; micrometres are for instruments.
 _UNITS = tuple(unit for unit in UNITS_M if unit != "um")
 # Radians that were read as degrees leave all rotations within 2 pi degrees of identity, per angle.
@@ -205,7 +207,7 @@ def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Cha
     `is_measured` is whether the camera's poses were measured from images of a board of stated size.
     """
     yield from _changes_of_side("robot", declared.robot)
-    words = "the images mirrored, or the robot's poses in a left-handed frame (one axis mirrored)"
+    words = f"{OR_IMAGES}the robot's poses in a left-handed frame (one axis mirrored)"
     yield Change(words, "robot", {"mirrored": True})
     yield from _axes()
     yield from _components(declared.robot.rotation)

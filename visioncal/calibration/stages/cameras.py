@@ -348,8 +348,8 @@ def locate_targets(seen: T) -> T:
 def _with_misnamed(seen: T) -> T:
     """Notes views that no pose fits by the lens of their camera, and one does by another's."""
     targets, edits, views = tuple(seen.session.boards.values()), list[str](), list[int]()
-    looks = {frame: look for frame, look in seen.cameras.items() if look.pixel_px is not None}
-    for (frame, look), (other, rival) in permutations(looks.items(), 2):
+    located = {frame: look for frame, look in seen.cameras.items() if look.pixel_px is not None}
+    for (frame, look), (other, rival) in permutations(located.items(), 2):
         lost = {view: at for view, at in look.corners.items() if view not in seen.poses}
         if not lost or look.lens is None or rival.lens is None or rival.pixel_px is None:
             continue

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
+from visioncal.calibration.guess.readings import OR_IMAGES
 from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import (
@@ -335,7 +336,7 @@ def _mirrored(run: RunState, found: Finding) -> Finding:
         words = f"In corners.csv, u_px and v_px are exchanged, as the lens shows. {found.words}"
         return replace(found, words=words, do=EXCHANGE_COLUMNS)
     if shows_print(run):
-        words = found.words.replace("the images mirrored, or ", "")
+        words = found.words.replace(OR_IMAGES, "")
         return replace(found, words=words, do=_LEFT_HANDED)
     return replace(found, do=_MIRRORED if run.cameras else replace(_MIRRORED, command=""))
 
