@@ -14,9 +14,12 @@ from support.refusals import raised
 from support.slopes import twists
 
 from visioncal.calibration.run import calibrate
-from visioncal.calibration.stages.thermal import ThermalFit, doubts, inputs_of
+from visioncal.calibration.stages.arms import Drift
+from visioncal.calibration.stages.thermal import doubts
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
+from visioncal.model.effects.heat import Heat as ArmHeat
+from visioncal.model.heating import recorded_inputs
 from visioncal.present.report.page import render
 from visioncal.results import Calibration
 from visioncal.results.arm import NOMINAL, ArmResult, WorkspaceSigma
@@ -73,7 +76,7 @@ def learnt(measured: str) -> Warmed:
     (how, truth, session), temperatures = recorded(measured), measured == "temperatures"
     warming = how.warming()
     whole = session.with_streams({"heat": warming.recorded(temperatures=temperatures)})
-    inputs = inputs_of(whole, truth.robot.joints.shape[1])
+    inputs = recorded_inputs(whole, truth.robot.joints.shape[1])
     return Warmed(truth, how.heats, warming, session, calibrate(session, level="thermal"), inputs)
 
 
@@ -293,9 +296,8 @@ def warming(change=lambda temperatures: temperatures, from_s=0.0):
     joints = 21.0 + rises * (1.0 - np.exp(-at_s / 1800.0))
     values = change(np.column_stack([joints, np.full(len(at_s), 21.0)]))[at_s[:, 0] >= from_s]
     heat = Inputs("temperatures", at_s[at_s[:, 0] >= from_s, 0], values[:, :6], values[:, 6])
-    return [
-        each.words for each in doubts(replace(ThermalFit.expected(ROBOT, ROBOT, heat), gain=1e3))
-    ]
+    drift = replace(Drift.expected(ArmHeat("", ROBOT, heat)), gain=1e3)
+    return [each.words for each in doubts(drift)]
 
 
 def with_dead_sensor(temperatures):

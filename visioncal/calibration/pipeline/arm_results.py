@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.likely_steps import with_free_sizes
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
-from visioncal.calibration.stages.thermal import LEVEL
+from visioncal.calibration.stages.thermal import LEVEL, with_drift
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import covariance_of_size
@@ -28,7 +28,7 @@ from visioncal.robot.errors import ArmErrors
 STEP = "what moved at once"
 
 
-def arms_of(cell: Cell, robots: Mapping[str, RobotReport]) -> dict[str, RobotArm]:
+def arms_of(cell: Cell, robots: Mapping[str, RobotReport]) -> dict[str, Arm]:
     """Reads the nominal arms of a cell."""
     arms, session = {}, cell.session
     for name, robot in robots.items():
@@ -39,20 +39,20 @@ def arms_of(cell: Cell, robots: Mapping[str, RobotReport]) -> dict[str, RobotArm
                 for observation in session.observations
                 if name in observation.robots
             }
-            stations = np.flatnonzero(np.isfinite(cell.poses[key][:, 0, 0])).tolist()
-            views = [rows[station] for station in stations]
-            arms[key] = RobotArm.of(key, cell.poses[key], views, robot.matched, (session, name))
+            has_pose = np.isfinite(cell.poses[key][:, 0, 0]).tolist()
+            views = [rows[at] if is_posed else None for at, is_posed in enumerate(has_pose)]
+            arms[key] = Arm.of(key, cell.poses[key], views, robot.matched, (session, name))
     return arms
 
 
-def joint_offsets(arms: Mapping[str, RobotArm]) -> dict[str, FloatArray]:
+def joint_offsets(arms: Mapping[str, Arm]) -> dict[str, FloatArray]:
     """(s, 6, n) Jacobians of flanges with respect to joint offsets, of arms with a model."""
     jacobians = {name: arm.joint_offsets for name, arm in arms.items()}
     return {name: jacobian for name, jacobian in jacobians.items() if jacobian is not None}
 
 
 def covariance_from_other_sources(
-    fit: Fit, arms: Mapping[str, RobotArm], steps: Sequence[Step], *, is_fit: bool = True
+    fit: Fit, arms: Mapping[str, Arm], steps: Sequence[Step], *, is_fit: bool = True
 ) -> dict[str, FloatArray]:
     """Covariances (p, p) of a fit from sources other than noise, by source.
 
@@ -108,7 +108,7 @@ def misfit_covariance(fit: Fit, robot: str, errors: ArmErrors) -> FloatArray:
     return np.asarray(covariance)
 
 
-def with_lasting_errors(fit: Fit, arms: Mapping[str, RobotArm]) -> Fit:
+def with_lasting_errors(fit: Fit, arms: Mapping[str, Arm]) -> Fit:
     """The fit at what its unknowns are beside errors of arms that last in time.
 
     Lasting errors are alike at neighbouring stops: their mean says less than their number suggests.
@@ -122,8 +122,8 @@ def with_lasting_errors(fit: Fit, arms: Mapping[str, RobotArm]) -> Fit:
 
 
 def change_each(
-    arms: Mapping[str, RobotArm], fit: Fit, change: Callable[[RobotArm, Problem, State], RobotArm]
-) -> dict[str, RobotArm]:
+    arms: Mapping[str, Arm], fit: Fit, change: Callable[[Arm, Problem, State], Arm]
+) -> dict[str, Arm]:
     """Changes one arm after the other, with the errors of the others in the problem.
 
     Args:
@@ -144,7 +144,7 @@ def change_each(
     return changed
 
 
-def with_drifts(arms: Mapping[str, RobotArm], fit: Fit, level: str) -> dict[str, RobotArm]:
+def with_drifts(arms: Mapping[str, Arm], fit: Fit, level: str) -> dict[str, Arm]:
     """Estimates drift with temperature, one arm after the other, where the session determines it.
 
     Raises:
@@ -155,20 +155,20 @@ def with_drifts(arms: Mapping[str, RobotArm], fit: Fit, level: str) -> dict[str,
         return dict(arms)
     refused = []
 
-    def with_drift(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
+    def changed_arm(arm: Arm, nominal: Problem, start: State) -> Arm:
         try:
-            return arm.with_drift(nominal, start)
+            return with_drift(arm, nominal, start)
         except (DataError, DegenerateError) as error:
             refused.append(error.within(f"robot {arm.robot}"))
             return arm
 
-    changed = change_each(arms, fit, with_drift)
+    changed = change_each(arms, fit, changed_arm)
     if level == LEVEL and refused and len(refused) == len(changed):
         raise refused[0]
     return changed
 
 
-def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotArm]:
+def with_pose_errors(arms: Mapping[str, Arm], fit: Fit) -> dict[str, Arm]:
     """Estimates pose-dependent errors of arms without joint angles."""
 
     def found(name: str) -> ArmErrors | None:
@@ -191,8 +191,8 @@ def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
 
 
 def with_errors_beside_step(
-    arms: Mapping[str, RobotArm], fit: Fit, steps: Sequence[Step]
-) -> Mapping[str, RobotArm]:
+    arms: Mapping[str, Arm], fit: Fit, steps: Sequence[Step]
+) -> Mapping[str, Arm]:
     """Estimates pose-dependent errors again beside a sudden step, which they would also explain."""
     is_modelled = all(arm.is_modelled for arm in arms.values())
     if not steps or steps[0].kind not in (FRAME, SIZE) or is_modelled:

@@ -16,7 +16,7 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
-from visioncal.calibration.stages.arm_report import ArmReport
+from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clock_offset import ClockPair
@@ -176,7 +176,7 @@ def assess_fit(
         cell_fit,
         fit,
         steps,
-        {name: arm.report(fit, middles, convention) for name, arm in cell_fit.arms.items()},
+        {name: report_of(arm, fit, middles, convention) for name, arm in cell_fit.arms.items()},
         held_out,
         movements(cell_fit),
         faults,

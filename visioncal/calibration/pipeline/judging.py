@@ -280,7 +280,7 @@ def _arms(run: RunState) -> list[JudgedArm]:
     for index, (robot, intervals) in enumerate(zip(problem.robots, answer.intervals, strict=True)):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm
-        model = None if arm.matched is None else arm.matched.robot
+        model = arm.nominal
         stops = stops_of(problem, robot)
         poses = problem.poses[robot][stops]
         judged = JudgedArm(

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.types import IntArray
 from visioncal.estimation.appearance import LensBoardParameters
@@ -27,7 +27,7 @@ class ObservedPoses(Observed):
     used: tuple[int, ...] = ()  # The views in the problem, in the session's order.
     # Lens and boards with their free values; None without corners.
     free: LensBoardParameters | None = None
-    calibrated: RobotArm | None = None  # The robot's calibrated arm; None for the nominal one.
+    calibrated: Arm | None = None  # The robot's calibrated arm; None for the nominal one.
 
     @classmethod
     def of(cls, observed: Observed) -> Self:
@@ -50,12 +50,12 @@ class ObservedPoses(Observed):
         return replace(self, poses={**self.poses, **given})
 
     @cached_property
-    def robot_arm(self) -> RobotArm:
+    def robot_arm(self) -> Arm:
         """The robot's arm at all views with a pose, in their order."""
         if self.calibrated is not None:
             return self.calibrated
         rows = {view.number: view for view in self.session.views}
-        return RobotArm.of(
+        return Arm.of(
             ROBOT,
             np.array([*self.base_from_flange.values()]).reshape(-1, 4, 4),
             [rows[index] for index in self.base_from_flange],
@@ -63,7 +63,7 @@ class ObservedPoses(Observed):
             (self.session, next(iter(self.robots), "")),
         )
 
-    def arm_at(self, views: Sequence[int]) -> RobotArm:
+    def arm_at(self, views: Sequence[int]) -> Arm:
         """The robot's arm at some views."""
         places = {view: at for at, view in enumerate(self.base_from_flange)}
         return self.robot_arm.at(np.array([places[view] for view in views], dtype=np.int64))

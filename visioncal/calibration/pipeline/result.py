@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.judging import weakest_link
 from visioncal.calibration.pipeline.lens_fields import lens_field_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
@@ -252,7 +252,7 @@ def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
     )
 
 
-def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
+def _fitted_arm(run: RunState, arm: Arm) -> FittedArm | None:
     """An arm's errors: their parameters, and their estimates relative to the nominal arm."""
     model, errors = arm.model, arm.errors
     if errors is None or not errors.of_links:
@@ -279,7 +279,7 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     )
 
 
-def _fitted_columns(run: RunState, arms: Iterable[RobotArm]) -> IntArray:
+def _fitted_columns(run: RunState, arms: Iterable[Arm]) -> IntArray:
     """Columns of a fit's edges, of free values of lenses and boards, and of arms' errors."""
     fit = run.assessment.fit
     columns = [fit.unknowns.of_kinds(EDGE, LENS)]

@@ -8,7 +8,7 @@ from typing import TypedDict, TypeVar, Unpack
 
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import uncertainty_of
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.kinematics import check_level
@@ -90,7 +90,7 @@ class RunState(Observed):
         return replace(work, noise_95=answer.of_robot(answer.noise_95))
 
     @property
-    def robot_arm(self) -> RobotArm:
+    def robot_arm(self) -> Arm:
         """The only robot's arm."""
         return next(iter(self.cell_fit.arms.values()))
 

@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.inliers import initial_inliers, updated_inliers, with_repeats
 from visioncal.calibration.pipeline.starting import Start, find_start
-from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms, with_link_errors
+from visioncal.calibration.stages.arms import Arm, arm_effects, check_arms, with_link_errors
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
@@ -79,7 +79,7 @@ def solve(
         DegenerateError: A robot is linked to nothing, a frame may be in two places, or the motion
             of one robot leaves a direction undetermined.
     """
-    arms: Mapping[str, RobotArm] = arms_of(cell, observed.robots)
+    arms: Mapping[str, Arm] = arms_of(cell, observed.robots)
     check_arms(arms, level)
     if cell.session.has_one_pair:
         can = solver == "joint" and all(arm.is_modelled for arm in arms.values())
@@ -121,7 +121,7 @@ def _with_shapes(start: Start, measured: MeasuredErrors) -> Start:
 def _fit(
     start: Start,
     observed: Observed,
-    arms: Mapping[str, RobotArm],
+    arms: Mapping[str, Arm],
     level: str,
     measured: MeasuredErrors,
 ) -> CellFit:
@@ -238,9 +238,7 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     return other if misfit(inliers) - misfit(other.inlier_fit) > CONTRADICTION else cell_fit
 
 
-def _without_misreported(
-    inliers: InlierFit, arms: Mapping[str, RobotArm], before: Mask
-) -> InlierFit:
+def _without_misreported(inliers: InlierFit, arms: Mapping[str, Arm], before: Mask) -> InlierFit:
     """Removes new inliers whose reported robot pose contradicts the arm's joint angles."""
     # They agree with joints and camera, but their reported poses would mislead the next fit.
     problem, used = inliers.problem, inliers.used.copy()
@@ -356,14 +354,12 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     return cell_fit
 
 
-def _choose_levels(
-    cell_fit: CellFit, noise: Noise, *, functions: bool = False
-) -> dict[str, RobotArm]:
+def _choose_levels(cell_fit: CellFit, noise: Noise, *, functions: bool = False) -> dict[str, Arm]:
     """Selects the errors of each arm; functions of its joints only where asked for."""
     fit = cell_fit.fit
     views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
 
-    def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
+    def with_level(arm: Arm, nominal: Problem, start: State) -> Arm:
         found = arm.with_level(nominal, start, cell_fit.level, views, noise, functions=functions)
         if not functions:
             return found

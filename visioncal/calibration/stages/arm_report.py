@@ -1,18 +1,24 @@
 """A calibrated arm as stops determine it: its parameters, its accuracy, and remarks on both."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
 from visioncal.calibration.stages import elastic
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.kinematics import SelectedArmLevel
+from visioncal.calibration.stages.thermal import drift_result
 from visioncal.core.choices import Convention
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import LEVER_M
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.armpair import ArmData
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
@@ -24,6 +30,7 @@ from visioncal.estimation.identifiability import (
 from visioncal.estimation.one_parameter import FarParameter, far_parameters
 from visioncal.estimation.parameters import Parameter, free_parameters, parameter_moves
 from visioncal.results.arm import (
+    ArmErrorsResult,
     ArmParameter,
     ArmResult,
     ArmSections,
@@ -35,6 +42,7 @@ from visioncal.results.arm import (
 from visioncal.robot import Robot
 from visioncal.robot.arm_model import RIGID
 from visioncal.robot.conversion import convert_table, parallel_axes, table_of
+from visioncal.robot.errors import ArmErrors
 from visioncal.robot.model import joint_words
 from visioncal.robot.tables import DHTable, table_from_document
 from visioncal.robot.workspace import postures
@@ -56,14 +64,32 @@ class ArmReport:
     doubts: tuple[Finding, ...] = ()  # Findings against the arm.
 
 
-def report_of(arm: ArmData, levels: SelectedArmLevel, convention: Convention | None) -> ArmReport:
-    """Reports a calibrated arm.
+def report_of(
+    arm: Arm, fit: Fit, middles: Mapping[str, FloatArray], convention: Convention | None = None
+) -> ArmReport:
+    """Findings about an arm.
 
     Args:
-        arm: The observations of the arm.
-        levels: Its levels.
+        arm: The arm.
+        fit: The fit of a cell, with the arm's errors among the unknowns.
+        middles: (3,) centre of each printed target by its frame, in that frame [m].
         convention: Convention of the arm's table; see `add_parameters`.
     """
+    data, levels, found = arm.data(fit, middles), arm.kinematics, ArmReport()
+    sections = ArmSections(arm=None if levels is None else levels.result)
+    if data is not None and levels is not None:
+        found = _calibrated(data, levels, convention)
+        sections = found.sections
+    if arm.errors is not None and arm.errors.is_likely:
+        sections = replace(sections, arm_errors=_size_of(arm.errors))
+    if arm.drift is not None:
+        used = arm.at(stops_of(fit.problem, arm.robot))
+        sections = replace(sections, thermal=drift_result(arm.drift, used))
+    return replace(found, sections=sections)
+
+
+def _calibrated(arm: ArmData, levels: SelectedArmLevel, convention: Convention | None) -> ArmReport:
+    """Findings about a calibrated arm."""
     model, notes = arm.model, list[str]()
     result = replace(
         levels.result,
@@ -85,6 +111,21 @@ def report_of(arm: ArmData, levels: SelectedArmLevel, convention: Convention | N
     doubts = [*mistyped, *elastic.play_findings(result.backlash)]
     doubts += () if springs is None else elastic.doubts(springs)
     return ArmReport(ArmSections(arm=result, elastic=springs), tuple(notes), tuple(doubts))
+
+
+def _size_of(errors: ArmErrors) -> ArmErrorsResult:
+    """Size of the errors, as a section of a calibration."""
+    of: Literal["flange"] | None = None
+    sigmas = errors.sigma * np.array([1.0, LEVER_M])
+    if errors.fit_sigmas is not None and errors.white is not None:
+        of, sigmas = "flange", np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
+    return ArmErrorsResult(
+        sigma_mm=1e3 * float(sigmas[1]),
+        sigma_deg=float(np.rad2deg(sigmas[0])),
+        likelihood_ratio=errors.gain,
+        estimated=errors.is_estimated,
+        of=of,
+    )
 
 
 def far_off(parameters: Sequence[ArmParameter], robot: Robot) -> Iterator[str]:

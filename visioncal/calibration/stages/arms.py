@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.kinematics import (
     ASKED,
@@ -14,49 +14,102 @@ from visioncal.calibration.stages.kinematics import (
     SelectedArmLevel,
     select_errors,
 )
-from visioncal.calibration.stages.thermal import (
-    HeatedStops,
-    ThermalFit,
-    drift_result,
-    find_drift,
-    missing_error,
-)
-from visioncal.core.choices import Convention
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import LEVER_M, distances, invert, mean_transform
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.limits import DETERMINED
+from visioncal.core.transforms import distances, exp, invert, mean_transform
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.arm import arm_effect, find_arm_errors, rows_of, stops_of
 from visioncal.estimation.arm_sizes import most_orders
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.fit import Fit
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.estimation.unknowns import ARM, EDGE
-from visioncal.model.arm import sides_of_motion
-from visioncal.results.arm import ArmErrorsResult, ArmSections
+from visioncal.model import Moments
+from visioncal.model.arm import even_progress, sides_of_motion
+from visioncal.model.effects.heat import Heat
+from visioncal.model.heating import recorded_inputs
 from visioncal.robot import Loads, Robot
 from visioncal.robot.arm_model import HARMONICS, ArmModel, blocks_of
-from visioncal.robot.errors import ArmErrors, link_basis, pose_basis
+from visioncal.robot.errors import SIGNIFICANT, ArmErrors, link_basis, pose_basis
+from visioncal.robot.thermal import Inputs, ThermalModel
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
 
 
 @dataclass(frozen=True, eq=False)
-class RobotArm:
+class Drift:
+    """An arm's drift with its temperature."""
+
+    heat: Heat  # The effect on the robot's flange.
+    values: FloatArray  # (p,) its values.
+    covariance: FloatArray  # (p, p) of these; that of their prior is the identity.
+    gain: float = 0.0  # Twice the gain in log-likelihood over an arm without drift.
+    before_m: float = 0.0  # Residual of the views without drift, as a root mean square [m].
+    after_m: float = 0.0  # The same with drift [m].
+    rise_k: float = 0.0  # Largest range of a link's temperature over the views [K].
+
+    @classmethod
+    def expected(cls, heat: Heat) -> Self:
+        """The prior of an effect."""
+        return cls(heat, np.zeros(heat.count), np.eye(heat.count))
+
+    @property
+    def is_found(self) -> bool:
+        """Whether drift explains the views significantly."""
+        return self.gain > SIGNIFICANT
+
+    @cached_property
+    def model(self) -> ThermalModel:
+        """The arm with its coefficients and their covariance."""
+        scale = self.heat.sigmas
+        covariance = self.covariance * np.outer(scale, scale)
+        return replace(self.heat.arm(self.values), covariance=covariance)
+
+    @property
+    def not_determined(self) -> tuple[str, ...]:
+        """The parameters that stay at their prior, by joint."""
+        kinds = ("growth", "drift", "tau", "gain")
+        names = [f"{kind} of {joint}" for kind in kinds for joint in self.model.robot.joint_names]
+        pairs = zip(names, np.sqrt(np.diag(self.covariance)).tolist(), strict=False)
+        return tuple(name for name, share in pairs if share > DETERMINED)
+
+    def motion(self, moments: Moments) -> FloatArray:
+        """(k, 4, 4) drift of the flange at some moments, in its own frame."""
+        return exp(self.heat.twists(moments, self.values))
+
+    def effect(self, moments: Moments, *, is_held: bool = True) -> Effect:
+        """The parameters as an effect on the stops of a problem, which are the moments.
+
+        Held values are at zero and count in the covariance with their prior: the information of the
+        stops is in the problem itself.
+        """
+        robot, size = self.heat.frame, self.heat.count
+        values, prior = np.zeros(size), PriorInformation(np.eye(size), self.values)
+        jacobian = {robot: self.heat.slopes(moments, self.values)}
+        values = values if is_held else self.values
+        held = np.full(size, is_held)
+        return Effect(f"temperature of {robot}", values, prior, held, flange_jacobian=jacobian)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
     """A robot's arm at the s stops of a cell."""
 
     robot: str  # Name of the robot in the problem.
     reported: FloatArray  # (s, 4, 4) reported `base_from_flange`; NaN where unknown.
-    has_pose: Mask  # (s,) mask of the m stops with a pose of this robot.
-    # (m, n) joints at these; None where they are missing or belong to no model.
+    views: IntArray  # (s,) a view of each stop; -1 where it has no pose.
+    stamps_s: FloatArray  # (s,) when that was taken [s]; NaN where unknown.
+    loads: Loads  # Loads at the stops.
+    # (s, n) joints there; None where they are missing at a pose or belong to no model.
     joints_rad: FloatArray | None
-    loads: Loads  # Loads at these.
-    # Model, matched with poses and joints; None where none is known.
-    matched: MatchedJoints | None = None
-    heat: HeatedStops | None = None  # Heat inputs; None where joints are not known.
+    # Model, its base in the frame of the poses; None where none is known.
+    nominal: Robot | None = None
+    inputs: Inputs | None = None  # Its heat sources; None where none are known, or no joints.
     # Thermal drift fit; None where it was not requested or is impossible.
-    thermal: ThermalFit | None = None
+    thermal: Drift | None = None
     errors: ArmErrors | None = None  # Posture-dependent errors, where they are likely.
     # Compared levels; None where none were requested or possible.
     kinematics: SelectedArmLevel | None = None
@@ -68,57 +121,75 @@ class RobotArm:
         cls,
         robot: str,
         reported: FloatArray,
-        views: Sequence[View],
+        views: Sequence[View | None],
         matched: MatchedJoints | None,
         recorded: tuple[Session, str],
     ) -> Self:
         """Builds a nominal arm.
 
-        `views` are the rows at the m stops with a pose, `recorded` the session and the robot's name
-        there.
+        `views` are the rows at the stops, None where it has no pose; `recorded` is the session and
+        the robot's name there.
         """
         known = {} if matched is None else matched.joints_rad
-        joints = [known[view.number] for view in views if view.number in known]
-        q, heat = None, None
-        if 0 < len(joints) == len(views):
-            q = np.array(joints)
-            stamps_s = np.array([view.stamp_s for view in views], dtype=float)
-            numbers = np.array([view.number for view in views])
-            heat = HeatedStops(*recorded, q, numbers, stamps_s)
-        sides = [view.text.get("approach", "") for view in views]
-        loads = loads_of([view.numbers for view in views], sides)
-        has_pose = np.isfinite(reported[:, 0, 0])
-        return cls(robot, reported, has_pose, q, loads, matched, heat)
+        posed = [view for view in views if view is not None]
+        nominal, joints, inputs = None if matched is None else matched.robot, None, None
+        if nominal is not None and posed and all(view.number in known for view in posed):
+            none, (session, name) = np.zeros(nominal.joint_count), recorded
+            joints = np.array([none if view is None else known[view.number] for view in views])
+            inputs = recorded_inputs(session, nominal.joint_count, name)
+        sides = ["" if view is None else view.text.get("approach", "") for view in views]
+        return cls(
+            robot,
+            reported,
+            np.array([-1 if view is None else view.number for view in views]),
+            np.array([None if view is None else view.stamp_s for view in views], dtype=float),
+            loads_of([{} if view is None else view.numbers for view in views], sides),
+            joints,
+            nominal,
+            inputs,
+        )
+
+    @property
+    def has_pose(self) -> Mask:
+        """(s,) mask of the stops with a pose of this robot."""
+        return np.isfinite(self.reported[:, 0, 0])
 
     @property
     def with_sides(self) -> Self:
         """The arm with the side of each joint's last motion, where none of approach is stated."""
         if self.joints_rad is None or self.loads.side.any():
             return self
-        return replace(self, loads=replace(self.loads, side=sides_of_motion(self.joints_rad)))
+        sides = np.zeros_like(self.joints_rad)
+        sides[self.has_pose] = sides_of_motion(self.joints_rad[self.has_pose])
+        return replace(self, loads=replace(self.loads, side=sides))
 
     @property
     def is_modelled(self) -> bool:
         """Whether its joints at all stops belong to a known model."""
-        return self.matched is not None and self.joints_rad is not None
+        return self.joints_rad is not None
+
+    @property
+    def moments(self) -> Moments:
+        """The stops as moments; those without a time are as at the start of its heat sources."""
+        poses = np.where(self.has_pose[:, None, None], self.reported, np.eye(4))
+        joints = {} if self.joints_rad is None else {self.robot: self.joints_rad}
+        count, stamps_s = len(poses), self.stamps_s
+        if self.inputs is not None:
+            stamps_s = np.nan_to_num(stamps_s, nan=self.inputs.stamps_s[0])
+        progress, stops = even_progress(count), np.arange(count)
+        return Moments({self.robot: poses}, joints, progress, stops, stamps_s=stamps_s)
 
     def at(self, stops: IntArray) -> Self:
         """The arm at a subset (k,) of its stops."""
-        stood = self.has_pose[stops]
-        kept = (np.cumsum(self.has_pose) - 1)[stops][stood]
-        joints, errors = self.joints_rad, self.errors
+        errors = self.errors
         return replace(
-            self,
-            reported=self.reported[stops],
-            has_pose=stood,
-            joints_rad=None if joints is None else joints[kept],
-            loads=self.loads.chosen(kept),
-            heat=None if self.heat is None else self.heat.at(kept),
+            chosen_rows(self, stops),
+            loads=self.loads.chosen(stops),
             errors=None if errors is None else replace(errors, basis=errors.basis[stops]),
         )
 
     @property
-    def drift(self) -> ThermalFit | None:
+    def drift(self) -> Drift | None:
         """Significant drift with temperature; None without one."""
         return self.thermal if self.thermal is not None and self.thermal.is_found else None
 
@@ -130,27 +201,25 @@ class RobotArm:
     @property
     def poses(self) -> FloatArray:
         """(s, 4, 4) poses of the flange, by the calibrated arm where there is one."""
-        poses, drift = self.reported.copy(), self.drift
+        poses = self.reported
         if self.model is not None and self.joints_rad is not None:
-            poses[self.has_pose] = self.model.base_from_flange(self.joints_rad, self.loads)
-        if drift is not None and self.heat is not None:
-            poses[self.has_pose] = poses[self.has_pose] @ drift.motion(self.heat)
-        return poses
+            poses = self.model.base_from_flange(self.joints_rad, self.loads)
+        if self.drift is not None:
+            poses = poses @ self.drift.motion(self.moments)
+        return np.where(self.has_pose[:, None, None], poses, self.reported)
 
     @property
     def has_free_errors(self) -> bool:
         """Whether its errors are unknowns of the fit."""
         return self.errors is not None and self.errors.is_estimated
 
-    def effects(self) -> tuple[Effect, ...]:
+    def effects(self) -> Iterator[Effect]:
         """Effects that move its flange at the stops: drift uncertainty and errors."""
-        drift, found = self.drift, []
-        if drift is not None and self.heat is not None:
-            found.append(drift.effect(self.robot, self.heat, self.has_pose))
+        if self.drift is not None:
+            yield self.drift.effect(self.moments)
         if self.errors is not None and self.errors.is_estimated:
             values = None if self.model is None else self.model.values
-            found.append(arm_effect(self.errors, self.robot, values=values))
-        return tuple(found)
+            yield arm_effect(self.errors, self.robot, values=values)
 
     def applied_to(self, problem: Problem) -> Problem:
         """A problem with this arm's poses and effects in place of its former ones."""
@@ -162,19 +231,6 @@ class RobotArm:
         """A problem with this arm as it reports itself."""
         return self.as_reported.applied_to(problem)
 
-    def with_drift(self, problem: Problem, start: State) -> Self:
-        """Estimates the drift with temperature; the problem has this arm as reported.
-
-        Raises:
-            DataError: The session lacks its inputs.
-            DegenerateError: The temperature hardly changed.
-        """
-        heat = self.at(stops_of(problem, self.robot)).heat
-        if heat is None or self.matched is None:
-            raise missing_error()
-        drift = find_drift(problem, start, self.robot, heat, heat.inputs(), self.matched.robot)
-        return replace(self, thermal=drift)
-
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
         """Looks for errors of its links, by the likelihood at the fit with the nominal arm."""
         errors = find_arm_errors(likelihood, robot, self.basis) if self.is_modelled else None
@@ -185,10 +241,10 @@ class RobotArm:
 
         A wrong report says nothing against joints and cameras, but would mislead the fit.
         """
-        if self.matched is None or self.joints_rad is None:
+        if self.nominal is None or self.joints_rad is None:
             return agrees
-        nominal = self.matched.robot.base_from_flange(self.joints_rad)
-        tools, inliers = invert(nominal) @ self.reported[self.has_pose], agrees[self.has_pose]
+        poses = self.nominal.base_from_flange(self.joints_rad[self.has_pose])
+        tools, inliers = invert(poses) @ self.reported[self.has_pose], agrees[self.has_pose]
         residuals = distances(tools, mean_transform(tools[inliers]))
         matches = agrees.copy()
         # Rounding of written poses and joints [m, rad].
@@ -224,49 +280,27 @@ class RobotArm:
             np.repeat([shows_pose, True], 3),
         )
 
-    def report(
-        self, fit: Fit, middles: Mapping[str, FloatArray], convention: Convention | None = None
-    ) -> ArmReport:
-        """Findings about the arm.
-
-        Args:
-            fit: The fit of a cell, with the arm's errors among the unknowns.
-            middles: (3,) centre of each printed target by its frame, in that frame [m].
-            convention: Convention of the arm's table; see `arm_report.add_parameters`.
-        """
-        stops, data = stops_of(fit.problem, self.robot), self.data(fit, middles)
-        heat, levels, found = self.at(stops).heat, self.kinematics, ArmReport()
-        sections = ArmSections(arm=None if levels is None else levels.result)
-        if data is not None and levels is not None:
-            found = report_of(data, levels, convention)
-            sections = found.sections
-        if self.errors is not None and self.errors.is_likely:
-            sections = replace(sections, arm_errors=_size_of(self.errors))
-        if self.drift is not None and heat is not None:
-            drift = drift_result(self.drift, heat)
-            sections = replace(sections, thermal=drift)
-        return replace(found, sections=sections)
-
     @property
     def basis(self) -> FloatArray:
         """Jacobian (s, 6, p) of the flange by arm errors.
 
         The errors are those of the calibrated model, else of any link, else of the pose.
         """
-        if self.matched is None or self.joints_rad is None:
-            return self.by_stop(pose_basis(self.reported[self.has_pose]))
+        if self.nominal is None or self.joints_rad is None:
+            return pose_basis(self.moments.poses[self.robot])
         if self.model is None:
-            return self.by_stop(link_basis(self.matched.robot, self.joints_rad))
-        return self.by_stop(self.model.basis(self.joints_rad, self.loads))
+            return link_basis(self.nominal, self.joints_rad)
+        return self.model.basis(self.joints_rad, self.loads)
 
     @property
     def joint_offsets(self) -> FloatArray | None:
         """Jacobian (s, 6, n) of the flange by joint offsets; None without a model."""
-        if self.matched is None or self.joints_rad is None:
+        if self.nominal is None or self.joints_rad is None:
             return None
-        nominal = ArmModel.of(self.matched.robot, self.joints_rad, self.reported[self.has_pose])
+        posed = self.has_pose
+        nominal = ArmModel.of(self.nominal, self.joints_rad[posed], self.reported[posed])
         model = self.model or nominal
-        return self.by_stop(model.columns("offsets", self.joints_rad, self.loads))
+        return model.columns("offsets", self.joints_rad, self.loads)
 
     def with_level(
         self,
@@ -287,7 +321,7 @@ class RobotArm:
         """
         used = self.at(stops_of(problem, self.robot))
         q, every = used.joints_rad, self.joints_rad
-        if self.matched is None or q is None or every is None or not len(q):
+        if q is None or every is None or not len(q):
             return self
         # Fewest stops for functions of the joints.
         if functions and (HARMONICS not in ASKED[level] or len(q) < 20):
@@ -296,11 +330,10 @@ class RobotArm:
         for robot in self._hypotheses(used.loads):
             model = ArmModel.of(robot, q, used.reported).loaded(q, used.loads)
             bases = {
-                name: self.by_stop(model.columns(name, every, self.loads))
+                name: model.columns(name, every, self.loads)
                 for name in blocks_of(model.nominal, self.loads)
             }
-            harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
-            waves = None if harmonics is None else self.by_stop(harmonics)
+            waves = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
             kinematics = select_errors(
                 problem, start, self.robot, bases, model.torque_nm, level, noise, waves, nominal
             )
@@ -324,11 +357,11 @@ class RobotArm:
 
     def _hypotheses(self, loads: Loads) -> Iterator[Robot]:
         """The arm as stated; where loads could show it, also with its weight compensated."""
-        if self.matched is None:
+        if self.nominal is None:
             return
         # Of functions of the joints only that arm is tried which the loads have shown.
         shown = None if self.model is None else self.model.nominal.weight_compensated
-        stated = self.matched.robot
+        stated = self.nominal
         is_testable = stated.masses is not None and loads.any and not stated.weight_compensated
         if not (shown and is_testable):
             yield stated
@@ -353,35 +386,14 @@ class RobotArm:
         arm, first = replace(self, model=model), next(iter(self.kinematics.fit.errors.values()))
         return replace(arm, errors=replace(first, basis=arm.basis))
 
-    def by_stop(self, columns: FloatArray) -> FloatArray:
-        """(m, ...) rows of posed stops, spread over all s stops: zero where it has no pose."""
-        scattered = np.zeros((len(self.has_pose), *columns.shape[1:]))
-        scattered[self.has_pose] = columns
-        return scattered
 
-
-def _size_of(errors: ArmErrors) -> ArmErrorsResult:
-    """Size of the errors, as a section of a calibration."""
-    of: Literal["flange"] | None = None
-    sigmas = errors.sigma * np.array([1.0, LEVER_M])
-    if errors.fit_sigmas is not None and errors.white is not None:
-        of, sigmas = "flange", np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
-    return ArmErrorsResult(
-        sigma_mm=1e3 * float(sigmas[1]),
-        sigma_deg=float(np.rad2deg(sigmas[0])),
-        likelihood_ratio=errors.gain,
-        estimated=errors.is_estimated,
-        of=of,
-    )
-
-
-def arm_effects(arms: Mapping[str, RobotArm]) -> Iterator[Effect]:
-    """The effects of all arms; see `RobotArm.effects`."""
+def arm_effects(arms: Mapping[str, Arm]) -> Iterator[Effect]:
+    """The effects of all arms; see `Arm.effects`."""
     for arm in arms.values():
         yield from arm.effects()
 
 
-def with_link_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotArm]:
+def with_link_errors(arms: Mapping[str, Arm], fit: Fit) -> dict[str, Arm]:
     """Looks for errors of the links of the arms whose errors are not free yet."""
     likelihood = robot_likelihood(fit.problem, fit.state, fit.noise)
     return {
@@ -392,14 +404,14 @@ def with_link_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
     }
 
 
-def check_arms(arms: Mapping[str, RobotArm], level: str) -> None:
+def check_arms(arms: Mapping[str, Arm], level: str) -> None:
     """Refuses a level that the loads cannot give.
 
     Raises:
         DataError: Compliance is requested, and no load bends the joints.
     """
     for arm in arms.values():
-        robot = arm.matched.robot if arm.matched else None
+        robot = arm.nominal
         if level == "elastic" and robot and robot.masses is None and not arm.loads.any:
             raise DataError(
                 f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does "

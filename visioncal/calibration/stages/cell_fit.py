@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm, arm_effects, with_link_errors
+from visioncal.calibration.stages.arms import Arm, arm_effects, with_link_errors
 from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.error_sizes import ErrorSizes
 from visioncal.calibration.stages.validate import chain_rms_px
@@ -43,7 +43,7 @@ class CellFit:
     linearised_corners: LinearisedCorners | None
     poses: tuple[ViewPoses, ...]  # The pose chosen for each row.
     unconnected: tuple[str, ...]  # Frames that no observation links to the rest.
-    arms: Mapping[str, RobotArm]  # The robots' arms, as far as they were calibrated.
+    arms: Mapping[str, Arm]  # The robots' arms, as far as they were calibrated.
     level: str  # The requested calibration level of the arms.
     # Errors of clocks, and those that grow with time, reach or gravity.
     other_effects: tuple[Effect, ...]

@@ -35,7 +35,7 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
@@ -178,7 +178,7 @@ class PickInputs:
     # (3,) of each target, in its frame [m]; of others, their origin.
     target_centres: Mapping[str, FloatArray]
     freedom: Mapping[str, float]  # Degrees of freedom of each robot's noise.
-    arms: Mapping[str, RobotArm]  # The robots' arms, at the fit's stops.
+    arms: Mapping[str, Arm]  # The robots' arms, at the fit's stops.
     # (3, b) Jacobian of each target's middle by the columns of boards, by its frame [m].
     centre_jacobians: Mapping[str, FloatArray]
     # (m, 2) turn [rad] and shift [m] of its views that were rejected, by camera; see `Picks`.

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.error_sizes import ErrorSizes, FoundEffect, OpenedEffect
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import stops_of
@@ -17,8 +17,6 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.model import Moments
-from visioncal.model.arm import even_progress
 from visioncal.model.effects import NAMED, Named
 from visioncal.session.frames import object_name
 
@@ -33,7 +31,7 @@ def of_random_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
 def random_effects(
     inliers: InlierFit,
-    arms: Mapping[str, RobotArm],
+    arms: Mapping[str, Arm],
     sizes: ErrorSizes,
     corners: LinearisedCorners | None,
     rows: IntArray | None,
@@ -59,14 +57,12 @@ def random_effects(
     return found
 
 
-def _of_flange(at: OpenedEffect, problem: Problem, arm: RobotArm) -> Effect:
+def _of_flange(at: OpenedEffect, problem: Problem, arm: Arm) -> Effect:
     """An effect on a flange, as it moves the poses of its robot."""
     robot = arm.robot
     poses = np.where(np.isfinite(problem.poses[robot]), problem.poses[robot], np.eye(4))
-    effect, count = replace(at.effect, frame=robot), len(poses)
-    joints = {} if arm.joints_rad is None else {robot: arm.by_stop(arm.joints_rad)}
-    moments = Moments({robot: poses}, joints, even_progress(count), np.arange(count))
-    seen, unseen = effect.columns(moments, np.ones(count)), effect.unseen(moments)
+    effect, moments = replace(at.effect, frame=robot), replace(arm.moments, poses={robot: poses})
+    seen, unseen = effect.columns(moments, np.ones(len(poses))), effect.unseen(moments)
     columns = np.append(seen, unseen, axis=2)
     size = columns.shape[2]
     prior = PriorInformation(np.eye(size) / at.size**2, np.zeros(size))

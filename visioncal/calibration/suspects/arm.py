@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import thermal
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.kinematics import findings
 from visioncal.calibration.suspects.mounting import other_mounting
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, REMARK, Suspect
@@ -41,7 +41,7 @@ def _found(run: RunState) -> Iterator[Finding]:
             yield finding.of("" if len(arms) == 1 else f"Robot {name}")
 
 
-def _of(arm: RobotArm, level: str, stops: int) -> Iterator[Finding]:
+def _of(arm: Arm, level: str, stops: int) -> Iterator[Finding]:
     is_cold = level == thermal.LEVEL and arm.thermal is None
     if is_cold or (arm.joints_rad is None and level not in ("auto", "hand-eye")):
         words = f"It stays as it reports itself: its rows lack what --level {level} needs."
@@ -55,7 +55,7 @@ def _of(arm: RobotArm, level: str, stops: int) -> Iterator[Finding]:
     if errors.fit_sigmas is not None:
         turn_rad, shift_m = (np.sqrt(3.0) * errors.fit_sigmas).tolist()
         turn_deg, shift_mm = float(np.rad2deg(turn_rad)), 1e3 * shift_m
-        repeats = (0.0, 0.0) if arm.matched is None else arm.matched.robot.repeatability
+        repeats = (0.0, 0.0) if arm.nominal is None else arm.nominal.repeatability
         # A servo arm's own repeatability puts its flange so far off.
         limits = (_LIMITS.repeatability * np.sqrt(3.0) * np.array(repeats)).tolist()
         limit_mm, limit_deg = map(max, _LIMITS.arm_errors, limits)
@@ -88,8 +88,8 @@ def _heat(run: RunState) -> Iterator[Finding]:
     is_late = bool(steps) and steps[0].kind == DRIFT
     for name, arm in arms.items():
         found = [] if arm.thermal is None else [*thermal.doubts(arm.thermal)]
-        is_open = arm.thermal is None and arm.heat is not None and run.cell_fit.level == "auto"
-        if is_open and arm.heat is not None and (words := thermal.unrecorded(arm.heat)):
+        is_open = arm.thermal is None and run.cell_fit.level == "auto"
+        if is_open and (words := thermal.unrecorded(arm)):
             # Without drift of the residuals they are of no use.
             kind = thermal.TEMPERATURES if is_late else NOTE
             step = Remedy("Write stamp_s of streams and views.csv in seconds of one clock.")

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import change_each
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.kinematics import LevelFit, SelectedArmLevel
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
@@ -25,13 +25,13 @@ KIND = "mounting"  # Of the finding.
 _CLEAR = 30.0
 
 
-def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
+def other_mounting(run: RunState, arm: Arm) -> Finding | None:
     """The finding that another direction of gravity explains what bends an arm, if one does."""
     kinematics, fit = arm.kinematics, run.cell_fit.fit
     documents = {robot_key(name): at for name, at in run.session.robot_documents.items()}
-    if kinematics is None or arm.matched is None or arm.robot not in documents:
+    if kinematics is None or arm.nominal is None or arm.robot not in documents:
         return None
-    known, declared = arm.matched.robot, Robot.from_document(documents[arm.robot])
+    known, declared = arm.nominal, Robot.from_document(documents[arm.robot])
     noise_rad, noise_m = fit.noise.robots[fit.robots.index(arm.robot)].tolist()
     repeats_mm, repeats_deg = known.repeatability
     # An arm of this repeatability leaves as much anyway.
@@ -69,19 +69,18 @@ def other_mounting(run: RunState, arm: RobotArm) -> Finding | None:
 
 
 def _level(
-    run: RunState, arm: RobotArm, gravity: FloatArray, nominal_fit: LevelFit | None
+    run: RunState, arm: Arm, gravity: FloatArray, nominal_fit: LevelFit | None
 ) -> SelectedArmLevel | None:
     """The errors of an arm with (3,) gravity in the base of its poses [m/s^2]."""
     cell_fit = run.cell_fit
 
-    def with_gravity(other: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        matched = other.matched
-        if other.robot != arm.robot or matched is None:
+    def with_gravity(other: Arm, nominal: Problem, start: State) -> Arm:
+        robot = other.nominal
+        if other.robot != arm.robot or robot is None:
             return other
-        robot = matched.robot
         document = {**robot.document, "gravity_m_s2": gravity.tolist()}
         robot = replace(robot, document=document, gravity=gravity)
-        other = replace(other, matched=replace(matched, robot=robot), model=None)
+        other = replace(other, nominal=robot, model=None)
         return other.with_level(
             nominal, start, cell_fit.level, run.used, cell_fit.noise, nominal=nominal_fit
         )

@@ -344,8 +344,7 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, st
     limit = np.sqrt(inliers.distances.limit / directions)
     off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
     marginal, reasons = set[int](), dict[int, str]()
-    known = (arm.matched for arm in cell_fit.arms.values())
-    robots = [matched.robot for matched in known if matched is not None]
+    robots = [arm.nominal for arm in cell_fit.arms.values() if arm.nominal is not None]
     most_mm, most_deg = farthest_by_arms(robots)
     for at, cause in causes.items():
         row, mm = cell_fit.cell.rows[at], 1e3 * float(off_m[at])
@@ -389,7 +388,7 @@ def _cause(
         )
     cause, problem = _WRONG, cell_fit.inlier_fit.problem
     of_stop = problem.observations.stops
-    by_joints = {name for name, arm in cell_fit.arms.items() if arm.matched is not None}
+    by_joints = {name for name, arm in cell_fit.arms.items() if arm.nominal is not None}
     reported = (
         problem.poses[name][of_stop[at]]
         for name, flange in problem.tree.flanges.items()

@@ -93,8 +93,8 @@ def _words(step: Step, run: RunState) -> str:
     when, thing = run.cell_fit.cell.start_words(step.stop), _THINGS.get(step.of, step.of)
     if step.kind == JOINT:
         arms, index = run.cell_fit.arms, step.candidate.joint
-        matched = arms[step.of].matched
-        joint = f"joint {index + 1}" if matched is None else joint_words(index, matched.robot)
+        robot = arms[step.of].nominal
+        joint = f"joint {index + 1}" if robot is None else joint_words(index, robot)
         joint += f" of robot {step.of}" * (len(arms) > 1)
         # The reading's change is opposite to the correction that gives the joint's angle.
         changed_deg, sigma_deg = np.rad2deg([abs(first), sigma]).tolist()

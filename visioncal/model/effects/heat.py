@@ -25,6 +25,7 @@ class Heat(Effect):
     clause = "the arm is warmer at some stops than at others"
     robot: Robot
     inputs: Inputs  # Its heat sources.
+    grown: Robot | None = None  # The arm whose lengths grow; None for the same one.
 
     @property
     def size(self) -> Size:
@@ -34,7 +35,7 @@ class Heat(Effect):
     @property
     def count(self) -> int:
         """See `Effect`."""
-        return len(self._sigmas)
+        return len(self.sigmas)
 
     def is_shown(self, moments: Moments) -> bool:
         """Whether the links' temperatures are known at some moments, and differ."""
@@ -46,28 +47,29 @@ class Heat(Effect):
 
     def arm(self, values: FloatArray) -> ThermalModel:
         """The arm with some values."""
-        return self._usual.changed(self._sigmas * values)
+        return self._usual.changed(self.sigmas * values)
 
     def twists(self, moments: Moments, values: FloatArray) -> FloatArray:
         """See `Effect`."""
         arm = self.arm(values)
-        rises = arm.rises(arm.heating.links_c(self.inputs, self._times_s(moments)))
+        rises = arm.rises(arm.heating.links_c(self.inputs, self.times_s(moments)))
         moved = arm.jacobian(moments.joints[self.frame]) @ rises[:, :, None]
         return np.asarray(moved[:, :, 0])
 
     def slopes(self, moments: Moments, values: FloatArray) -> FloatArray:
         """See `Effect`."""
-        arm, at_s = self.arm(values), self._times_s(moments)
+        arm, at_s = self.arm(values), self.times_s(moments)
         links_c = arm.heating.links_c(self.inputs, at_s)
         heated = arm.heating.jacobian(self.inputs, at_s)
-        return arm.basis(moments.joints[self.frame], links_c, heated) * self._sigmas
+        return arm.basis(moments.joints[self.frame], links_c, heated) * self.sigmas
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
         return self.slopes(moments, np.zeros(self.count))
 
-    def _times_s(self, moments: Moments) -> FloatArray:
+    def times_s(self, moments: Moments) -> FloatArray:
+        """(k,) times of moments [s]."""
         last_s = float(self.inputs.stamps_s[-1])
         stamps_s = moments.stamps_s
         return (
@@ -78,8 +80,9 @@ class Heat(Effect):
 
     @cached_property
     def _usual(self) -> ThermalModel:
-        return usual_arm(self.robot, self.robot, self.inputs)
+        return usual_arm(self.robot, self.grown or self.robot, self.inputs)
 
     @cached_property
-    def _sigmas(self) -> FloatArray:
+    def sigmas(self) -> FloatArray:
+        """(c,) units of the values."""
         return sigmas_of(self.inputs)
