@@ -424,6 +424,24 @@ def test_a_lens_that_was_refocused_at_once_neither_varies_nor_moved(mount, seed,
     assert "--views 13-23" in first.do.command
 
 
+@pytest.mark.parametrize(
+    ("mount", "seed", "share", "shift_px"),
+    [
+        ("eye-in-hand", 1, -0.003, 0.0),
+        slow("eye-in-hand", 2, 0.003, 0.0),
+        slow("eye-to-hand", 1, 0.004, 1.5),
+        slow("eye-in-hand", 1, 0.0, 2.0),
+        ("eye-to-hand", 2, 0.0, 2.0),
+    ],
+)
+def test_a_given_lens_that_changed_a_little_competes_with_a_frame(mount, seed, share, shift_px):
+    """The robot's motion tells a focal length from a place, and corners alone hardly do."""
+    first = changed_lens(mount, seed, is_stated=True, share=share, shift_px=shift_px)
+    assert first.kind == ("focus" if share else "image_shifted")
+    assert "rom view 13 on, " + ("its focal length" if share else "the images") in first.words
+    assert ("lens changed at once" if share else "the lens was hit") in first.words
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("is_stated", [True, False])

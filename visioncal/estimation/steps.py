@@ -1,4 +1,4 @@
-"""Changes from some stop on: of a frame, a joint's offset or a board's size; and a base's drift.
+"""Changes from some stop on: of a frame, a joint, a lens or a board's size; and a base's drift.
 
 Each is a few columns of the residuals, and all stops are tried at once by running sums (Rao's score
 test of a change point, Page 1955). The evidence of a fit with the change decides; `moves` finds
@@ -32,7 +32,7 @@ from visioncal.estimation.solve import (
 )
 from visioncal.robot.errors import SIZES_M, TURN_PER_M, TWIST_UNITS
 
-FRAME, JOINT, SIZE, DRIFT = "frame", "joint", "size", "drift"
+FRAME, JOINT, SIZE, LENS, DRIFT = "frame", "joint", "size", "lens", "drift"
 # Sizes of changes with equal prior probability, and the unit of each value.
 _MOTION = SIZES_M, np.repeat([TURN_PER_M, 1.0], 3)
 _PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
@@ -40,6 +40,7 @@ _PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
     DRIFT: _MOTION,
     JOINT: ((1e-4, 1e-3, 1e-2, 1e-1), np.ones(1)),
     SIZE: ((1e-3, 1e-2, 1e-1), np.ones(1)),
+    LENS: ((1e-3, 1e-2, 1e-1), np.ones(3)),
 }
 # Largest share of the residuals that a change explains.
 _MOST_EXPLAINED = 0.99
@@ -49,7 +50,7 @@ _MOST_EXPLAINED = 0.99
 class Candidate:
     """A possible change during the session."""
 
-    kind: str  # `FRAME`, `JOINT`, `SIZE`, `DRIFT` of a base, or `CREEP` of another frame.
+    kind: str  # One of the above, or `CREEP` of another frame than a base.
     of: str  # The frame; of a joint or a drift the robot, as the problem names it.
     stops: IntArray  # The stops from which on it may have changed.
     effect: Effect | None = None  # The change as an effect on all stops; None for a frame's pose.
@@ -63,7 +64,7 @@ class Step:
     candidate: Candidate  # The change.
     stop: int  # The first stop after it.
     # (c,) change: twist of a frame in its own old pose, or of a base over the session [rad, m];
-    # actual minus reported angle [rad]; relative size.
+    # actual minus reported angle [rad]; relative size; of a lens see `lenses_of`.
     value: FloatArray
     covariance: FloatArray  # (c, c) of the change.
     gain: float  # Twice the gain in log-likelihood, or the log Bayes factor of `evidence`.
@@ -129,6 +130,23 @@ def sizes_of(problem: Problem, fit: Solution) -> list[Candidate]:
         effect = Effect.free(f"size of {frame}", by_sensor=jacobian)
         candidates.append(Candidate(SIZE, frame, _between(problem, rows), effect))
     return candidates
+
+
+def lenses_of(problem: Problem, moves: Mapping[str, FloatArray]) -> list[Candidate]:
+    """Cameras whose focal length and centre may have changed.
+
+    `moves` are (n, 6, 3) by camera: Jacobians of the measured poses by these, as shares of the
+    focal length.
+    """
+    return [
+        Candidate(
+            LENS,
+            camera,
+            _between(problem, np.asarray(by_lens.any(axis=(1, 2)))),
+            Effect.free(f"lens of {camera}", by_sensor=by_lens),
+        )
+        for camera, by_lens in moves.items()
+    ]
 
 
 def drift_of(problem: Problem, robot: str) -> Candidate:

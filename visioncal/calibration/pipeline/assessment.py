@@ -163,7 +163,8 @@ def assess_fit(
     if not observed.misread:
         converged = fit.solution if is_fit else fit_problem(fit.problem, fit.state)
         offsets = joint_offsets(cell_fit.arms)
-        steps = steps_of(replace(fit, solution=converged), errors, offsets)
+        converged_fit = replace(fit, solution=converged)
+        steps = steps_of(converged_fit, errors, offsets, cell_fit.lens_changes)
         arms = with_errors_beside_step(cell_fit.arms, fit, steps)
         cell_fit = replace(cell_fit, arms=arms)
     by_source = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)

@@ -94,6 +94,25 @@ class CellFit:
         """The fit of the inliers, with the covariance by noise and priors alone."""
         return Fit(self.inlier_fit.part, self.inlier_fit.fit, self.linearised_corners)
 
+    @cached_property
+    def lens_changes(self) -> dict[str, FloatArray]:
+        """(n, 6, 3) by camera: Jacobian of the inliers' poses by changes of its lens.
+
+        Of the focal length, and of the centre along both axes, as shares of the focal length.
+        """
+        found, seen = dict[str, FloatArray](), self.linearised_corners
+        if seen is None:
+            return found
+        rows = self.all_rows(seen)[self.inlier_fit.used]
+        for name, compressed in zip(seen.camera_parameters.problems, seen.compressed, strict=True):
+            part, focal = seen.camera_parameters.rows(name), seen.camera_parameters.camera(name)
+            fx, fy = focal.matrix[:2].tolist()
+            units = np.array([[fx, fy, 0.0, 0.0], [0.0, 0.0, fx, 0.0], [0.0, 0.0, 0.0, fy]]).T
+            moves = np.zeros((len(seen.views) + 1, 6, 3))
+            moves[part] = compressed.by_shared[:, :, :4] @ units
+            found[name] = moves[rows]
+        return found
+
     def pixels(
         self,
         rows: Sequence[ObservationRow],

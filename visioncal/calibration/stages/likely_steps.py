@@ -25,6 +25,7 @@ from visioncal.estimation.steps import (
     find_steps,
     frames_of,
     joints_of,
+    lenses_of,
     sizes_of,
     twice,
 )
@@ -37,14 +38,17 @@ _CLEARLY = 2.0 * float(np.log(100.0))
 
 
 def steps_of(
-    fit: Fit, errors: Mapping[str, ArmErrors], offsets: Mapping[str, FloatArray]
+    fit: Fit,
+    errors: Mapping[str, ArmErrors],
+    offsets: Mapping[str, FloatArray],
+    lenses: Mapping[str, FloatArray],
 ) -> tuple[Step, ...]:
     """The likeliest steps of a fit, as `likely_steps`, beside boards of any size.
 
     A board whose size is held, since errors of an arm are confounded with it, leaves residuals by
     distance. The first views may be nearer than the rest, and a change from then on explains these.
     """
-    found = likely_steps(fit.problem, fit.solution, errors, offsets)
+    found = likely_steps(fit.problem, fit.solution, errors, offsets, lenses)
     sized = with_free_sizes(fit)
     if not found or sized is fit:
         return found
@@ -55,7 +59,7 @@ def steps_of(
     size = fit.problem.size
     return tuple(
         replace(step, spread=step.spread[:size, :size])
-        for step in likely_steps(sized.problem, sized.solution, arm_errors, offsets)
+        for step in likely_steps(sized.problem, sized.solution, arm_errors, offsets, lenses)
     )
 
 
@@ -86,6 +90,7 @@ def likely_steps(
     fit: Solution,
     errors: Mapping[str, ArmErrors],
     offsets: Mapping[str, FloatArray],
+    lenses: Mapping[str, FloatArray],
 ) -> tuple[Step, ...]:
     """The likeliest step that the residuals show, followed by others about as likely; or a drift.
 
@@ -97,6 +102,7 @@ def likely_steps(
         fit: The converged fit of the problem.
         errors: Errors of arms whose joints are not known, by robot.
         offsets: (s, 6, n) Jacobian of the flange by joint offsets, for the other robots.
+        lenses: (n, 6, 3) Jacobian of the measured poses by changes of a lens, by camera.
     """
     robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= FEWEST_STOPS]
     if not robots:
@@ -104,6 +110,7 @@ def likely_steps(
     still = still_frames(problem, problem.unknown)
     candidates = frames_of(problem, still) + sizes_of(problem, fit)
     candidates += joints_of(problem, {name: offsets[name] for name in robots if name in offsets})
+    candidates += lenses_of(problem, lenses)
     candidates += [drift_of(problem, robot) for robot in robots]
     # A push shifts positions alone, and dominates their noise.
     found = find_steps(problem, fit, candidates, kinds=2)

@@ -140,7 +140,8 @@ def _proves(run: RunState, trial: Trial) -> bool:
         return True
     # A step is sought in the fit, which has the cure.
     errors = {name: arm.errors for name, arm in arms.items() if arm.errors}
-    rivals = likely_steps(*trial.without, errors, joint_offsets(run.cell_fit.arms))
+    offsets, lenses = joint_offsets(run.cell_fit.arms), run.cell_fit.lens_changes
+    rivals = likely_steps(*trial.without, errors, offsets, lenses)
     lost, least = (
         robot_likelihood(part, solved.state, fit.noise).negative_log_likelihood
         for part, solved in (trial.without, trial.cured)

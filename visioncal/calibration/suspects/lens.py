@@ -13,7 +13,7 @@ from visioncal.calibration.stages.corner_sizes import smaller_picture
 from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
-from visioncal.core.limits import CONTRADICTION
+from visioncal.core.limits import CLEAR_RATIO, CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
@@ -22,6 +22,7 @@ from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
+from visioncal.estimation.steps import Step
 from visioncal.model.effects.board_sags import BoardSags
 from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.model.effects.window import Window, nearer
@@ -170,7 +171,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
     for name, noise_px in fit.sigmas_px.items():
         levels, distance_m = fit.lens_levels(name), mean_distance_m(fit, name)
         field, *changes = levels.gains[:3]
-        of = "The lens" if len(fit.sigmas_px) == 1 else f"The lens of {name}"
+        of = _lens_words(fit, name)
         if field > SIGNIFICANT:
             if (model := _of_fisheye(run, name, of)) is not None:
                 yield replace(model, mahalanobis_sq=field)
@@ -206,7 +207,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
         if zoom is not None and zoom.station is None and abs(zoom.share) > _MOST_CREEP:
             continue
         if zoom is not None:
-            yield _zoomed(run, of, zoom, changes[1])
+            yield _zoomed(run, name, zoom, changes[1])
         elif how:
             yield Finding(
                 "focus",
@@ -306,9 +307,22 @@ def pane_finding(window: Window, values: FloatArray) -> Finding:
     )
 
 
-def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
+def changed_lens(run: RunState, step: Step) -> Finding:
+    """The finding that a lens changed at once, by a step of what the robot's motion shows."""
+    share, *shift = step.value.tolist()
+    x_px, y_px = run.assessment.fit.camera(step.of).matrix[:2] * shift
+    zoom = Zoom(step.stop, share, (float(x_px), float(y_px)))
+    return replace(_zoomed(run, step.of, zoom, step.gain), consequence="")
+
+
+def _lens_words(fit: Fit, camera: str) -> str:
+    return "The lens" if len(fit.sigmas_px) == 1 else f"The lens of {camera}"
+
+
+def _zoomed(run: RunState, camera: str, zoom: Zoom, gain: float) -> Finding:
     """The finding that a lens changed by more than one that warms up."""
     instead, cell = run.cell_fit.sizes.instead_of(zoom.kind), run.cell_fit.cell
+    of = _lens_words(run.assessment.fit, camera)
     share = f"{figure(100.0 * abs(zoom.share))} % "
     share += "longer" if zoom.share > 0.0 else "shorter"
     words = f"{of} crept, as where focus or zoom give way: its focal length became {share}."
@@ -317,7 +331,13 @@ def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
         first = cell.start_words(zoom.station)
         do = cell.or_separately("Fix zoom and focus", zoom.station)
         words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
-        words += f"its focal length is {share}."
+        # Corners are a quarter of the width from the centre, on average.
+        by_zoom_px = 0.25 * abs(zoom.share) * run.assessment.fit.camera(camera).resolution[0]
+        shift_px, (x_px, y_px) = float(np.hypot(*zoom.shift_px)), map(figure, zoom.shift_px)
+        words += f"its focal length is {share}"
+        if shift_px > by_zoom_px:
+            words += f" and its centre ({x_px}, {y_px}) px from where it was"
+        words += "."
         if zoom.kind == "lens changes":
             is_longer = abs(zoom.share) > _ALONE
             words = f"{of} changed at once: {first}, its distortion is another one"
@@ -325,8 +345,9 @@ def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
             words += f", as where {'it was zoomed or refocused, ' * is_longer}pictures are "
             words += "rectified in one part alone, or another lens was put on."
             do = cell.or_separately(_ONE_LENS, zoom.station)
-        elif np.hypot(*zoom.shift_px) > _SHIFTED_PX and not instead:
-            do = cell.or_separately("Keep one region of interest", zoom.station)
+        elif shift_px > min(_SHIFTED_PX, CLEAR_RATIO * by_zoom_px) and not instead:
+            keep = "Keep one region of interest" if shift_px > _SHIFTED_PX else "Fix the lens"
+            do = cell.or_separately(keep, zoom.station)
             return _shifted(of, zoom, f"{first}, ", do, gain)
     counts = "The result counts it as scatter."
     return Finding("focus", words, do, mahalanobis_sq=gain, consequence=counts, rivals=instead)
@@ -335,11 +356,12 @@ def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
 def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Finding:
     """The finding that images are shifted from some view on."""
     x_px, y_px = map(figure, zoom.shift_px)
+    words = f"{first[0].upper()}{first[1:]}the images are shifted by ({x_px}, {y_px}) px, as where "
+    if np.hypot(*zoom.shift_px) > _SHIFTED_PX:
+        words += "another part of the sensor is read (a region of interest), or "
     return Finding(
         "image_shifted",
-        f"{first[0].upper()}{first[1:]}the images are shifted by ({x_px}, {y_px}) px, as where "
-        "another part of the sensor is read (a region of interest), or "
-        f"{of[0].lower()}{of[1:]} was hit.",
+        f"{words}{of[0].lower()}{of[1:]} was hit.",
         do,
         mahalanobis_sq=gain,
     )

@@ -1,11 +1,13 @@
 """Parts that moved, slipped or were exchanged at some stop, or drifted over the session."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE
+from visioncal.calibration.suspects.lens import changed_lens
 from visioncal.calibration.suspects.moved_views import (
     OF_OTHER_FRAMES,
     is_switched,
@@ -18,7 +20,7 @@ from visioncal.core.number_format import figure, mm_and_deg, ranges
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
+from visioncal.estimation.steps import DRIFT, FRAME, JOINT, LENS, SIZE, Step, with_step
 from visioncal.robot.model import joint_words
 
 _LIMITS = CalibrationLimits()
@@ -41,7 +43,14 @@ def _found(run: RunState) -> Iterator[Finding]:
         mm > _LIMITS.arm_errors[0] or deg > _LIMITS.arm_errors[1] for mm, deg in moved
     ):
         return
-    step = steps[0]
+    step, between = steps[0], "; the result is between before and after."
+    rivals = tuple(_words(other, run) for other in steps[1:2])
+    if step.kind == LENS:
+        # Another one that is known is in the fit, as scatter.
+        if step.of not in run.cell_fit.sizes.zoomed:
+            found = changed_lens(run, step)
+            yield replace(found, words=f"{found.words[:-1]}{between}", rivals=rivals)
+        return
     thing = _THINGS.get(step.of, step.of)
     fasten, note = f"Fasten {thing[0].lower()}{thing[1:]}", ""
     if (
@@ -59,12 +68,12 @@ def _found(run: RunState) -> Iterator[Finding]:
     is_drift = step.kind == DRIFT
     yield Finding(
         kind,
-        f"{_words(step, run)}; the result is between before and after.",
+        f"{_words(step, run)}{between}",
         Remedy(do)
         if is_drift
         else _of_tool(run, step, do) or cell.or_separately(do, step.stop, note),
         mahalanobis_sq=0.0 if is_drift else step.gain,
-        rivals=tuple(_words(other, run) for other in steps[1:2]),
+        rivals=rivals,
     )
 
 
@@ -89,6 +98,8 @@ def _edges(run: RunState, step: Step) -> tuple[FloatArray, FloatArray]:
 
 
 def _words(step: Step, run: RunState) -> str:
+    if step.kind == LENS:
+        return changed_lens(run, step).words[:-1]
     first, sigma = float(step.value[0]), float(np.sqrt(step.covariance[0, 0]))
     when, thing = run.cell_fit.cell.start_words(step.stop), _THINGS.get(step.of, step.of)
     if step.kind == JOINT:
