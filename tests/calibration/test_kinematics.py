@@ -137,7 +137,7 @@ def test_offsets_alone_are_distinguished_from_wrong_links():
     cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
     known = calibrated(cell)
     assert known.robot_arm.kinematics.level == "offsets"
-    by_name = {level.level: level for level in known.robot_arm.kinematics.result.levels}
+    by_name = {level.level: level for level in known.robot_arm.kinematics.levels}
     assert by_name["offsets"].held_out_mm < 0.3 * by_name["nominal"].held_out_mm
     # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
     found = known.robot_arm.model.robot.chain.functions[1:5, 0]
@@ -154,7 +154,7 @@ def test_a_wrong_gear_ratio_is_reported():
     geared = reporting(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
     known = calibrated(geared)
     assert known.robot_arm.kinematics.level == "eccentricity"
-    assert "ratios" in known.robot_arm.kinematics.fit.errors
+    assert "ratios" in known.robot_arm.model.weights
     # Told to a tenth beside errors of all links.
     assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
 
@@ -341,14 +341,15 @@ def test_functions_of_joints_are_found_and_make_the_arm_better_where_it_never_wa
     kinematics = known.robot_arm.kinematics
     assert kinematics.level == FUNCTIONS
     # One size from some hundred values, a length from a grid of factors of two.
-    assert kinematics.fit.errors["harmonics"].sigma == pytest.approx(3e-4, rel=0.4)
-    assert 0.12 <= kinematics.fit.functions.length_rad <= 0.5
+    model = known.robot_arm.model
+    assert model.error_rad * model.weights["harmonics"] == pytest.approx(3e-4, rel=0.4)
+    assert 0.12 <= model.waves.length_rad <= 0.5
     without = tracked_known(session_of(shop), level="offsets")
     squared, theirs = (np.sum(away_m(shop, it) ** 2, axis=1) for it in (known, without))
     assert np.mean(squared) < 0.25 * np.mean(theirs)
     # One arm: errors at 200 postures are of some dozen values that stops hardly tell.
     assert 0.4 < np.mean(squared) / np.mean(sigmas_m(known) ** 2) < 2.0
-    nominal, *_, chosen = kinematics.result.levels
+    nominal, *_, chosen = kinematics.levels
     assert chosen.rms_mm < chosen.held_out_mm < 0.3 * nominal.held_out_mm
     assert "optimism" not in [finding.kind for finding in known.verdict.findings]
     # The arm of the result has them.
@@ -586,7 +587,7 @@ def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for(
     assert rigid.robot_arm.kinematics.level != "nominal"
     assert any("No joint was found to bend" in reason for reason in rigid.verdict.reasons)
     assert known.robot_arm.model is None
-    assert [level.level for level in known.robot_arm.kinematics.result.levels] == ["nominal"]
+    assert [level.level for level in known.robot_arm.kinematics.levels] == ["nominal"]
     cell = simulate(replace(WRONG_LINKS, views=12))
     assert calibrated(cell, joints=False).robot_arm.kinematics is None
     with pytest.raises(DataError, match="needs the joint angles of every view"):

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -29,8 +29,15 @@ from visioncal.estimation.mixed import MixedEstimate
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
-from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT, JointFunctions
-from visioncal.robot.errors import SIGNIFICANT, ArmErrors
+from visioncal.robot.arm_model import (
+    BACKLASH,
+    COMPLIANCE,
+    HARMONICS,
+    WEIGHT,
+    ArmModel,
+    JointFunctions,
+)
+from visioncal.robot.errors import SIGNIFICANT
 
 # Lengths tried [rad], longest first, and the highest harmonic in inverse lengths: three thousandths
 # of the variance lie beyond. Shorter ones are not tried after this many that are less likely.
@@ -55,14 +62,9 @@ _TYPICAL = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class ArmSizes:
-    """The sizes of an arm's errors, estimated together."""
-
-    errors: Mapping[str, ArmErrors]  # The errors by block, without those of size zero.
-    levels: FloatArray  # (r, 2) of the robots' noise beside them; see `Noise`.
-    gain: float  # Twice the gain in log-likelihood over the nominal arm.
-    functions: JointFunctions | None = None  # Functions of the joints; None without any.
+# The arm with all blocks of errors but those of size zero, (r, 2) levels of robots' noise beside
+# these (see `Noise`), and twice the gain in log-likelihood over the nominal arm.
+SizedArm: TypeAlias = tuple[ArmModel, FloatArray, float]
 
 
 def most_orders() -> int:
@@ -81,10 +83,10 @@ def estimate_arm_sizes(
     state: State,
     noise: Noise,
     robot: str,
+    model: ArmModel,
     bases: Mapping[str, FloatArray],
-    torque_nm: float,
     harmonics: FloatArray | None = None,
-) -> ArmSizes | None:
+) -> SizedArm | None:
     """Estimates the sizes of the errors of one robot's arm.
 
     Args:
@@ -92,8 +94,8 @@ def estimate_arm_sizes(
         state: The solution with the nominal arm.
         noise: The noise levels; those of robots are estimated beside the sizes.
         robot: The robot.
+        model: The nominal arm.
         bases: (s, 6, p) by stop, Jacobian of the flange by the errors of each block.
-        torque_nm: The torque of a unit compliance [N m].
         harmonics: (s, 6, 2 n k) the same for sine and cosine of each joint and order from 2 on, as
             `Robot.harmonic_jacobian` has them; None to seek no functions of the joints.
 
@@ -104,7 +106,7 @@ def estimate_arm_sizes(
         LinAlgError: The columns are so large that their squares are no numbers.
     """
     nominal = robot_likelihood(problem, state, noise)
-    plain = _Blocks(nominal, problem.robots.index(robot), bases, torque_nm)
+    plain = _Blocks(nominal, problem.robots.index(robot), model, bases)
     columns: Iterable[FloatArray] = ()
     if harmonics is not None:
         harmonics = harmonics.reshape(*harmonics.shape[:2], -1, most_orders(), 2)
@@ -139,8 +141,8 @@ def estimate_arm_sizes(
         if worse == _WORSE:
             break
     is_likely = 2.0 * (found.value - best.value) > SIGNIFICANT
-    sizes = _sized(arm, best, waves) if is_likely else None
-    return sizes if sizes is not None and sizes.functions is not None else None
+    sized = _sized(arm, best, waves) if is_likely else None
+    return sized if sized is not None and sized[0].waves is not None else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +176,8 @@ class _Blocks:
 
     nominal: RobotLikelihood  # Of the nominal arm.
     robot: int  # Index of the robot.
+    model: ArmModel  # The nominal arm.
     bases: Mapping[str, FloatArray]  # (s, 6, p) the columns of each of the g blocks.
-    torque_nm: float  # The torque of a unit compliance [N m].
     low: tuple[float, ...] = ()  # Variances of a process's orders 1 and 2; empty for none.
 
     @cached_property
@@ -193,7 +195,7 @@ class _Blocks:
         """The likelihood of the robots' levels, with the arm's q errors as the last unknowns."""
         if not self.bases:
             return self.nominal
-        factor = {COMPLIANCE: self.torque_nm / 10.0}
+        factor = {COMPLIANCE: self.model.torque_nm / 10.0}
         typical = np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.bases])
         basis = np.concatenate(list(self.bases.values()), axis=2)
         return self.nominal.with_moves(self.robot, basis, self.shares, typical)
@@ -273,7 +275,7 @@ class _Blocks:
         return None
 
 
-def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> ArmSizes | None:
+def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> SizedArm | None:
     """The sizes without blocks that have no evidence, and without negative compliances.
 
     None where none are left that explain more than chance.
@@ -296,24 +298,20 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
         return None
     levels = np.exp(best.logs[:count]).reshape(-1, 2)
     sizes = np.sqrt(arm.shares @ np.exp(2.0 * best.logs[count:]))
-    errors = {
-        name: ArmErrors(basis, float(sizes[arm.slice_of(name)][0]), gain, of_links=True)
-        for name, basis in arm.bases.items()
-    }
-    if waves is None or HARMONICS not in errors:
-        return ArmSizes(errors, levels, gain)
+    by_block = {name: float(sizes[arm.slice_of(name)][0]) for name in arm.bases}
+    compliance = arm.bases.get(COMPLIANCE)
+    yielding = None if compliance is None else np.any(compliance, axis=(0, 1))
+    if waves is None or HARMONICS not in by_block:
+        return arm.model.with_errors(by_block, yielding), levels, gain
     # Combinations that the observations do not determine keep their prior.
-    block, second = errors[HARMONICS], errors.pop(_SECOND)
-    share = second.sigma / block.sigma
+    share = by_block.pop(_SECOND) / by_block[HARMONICS]
     weights = np.linalg.inv(arm.likelihood.model.units.total(best.logs)[arm.robot_units])
     jacobian = np.concatenate([share * arm.columns(_SECOND), arm.columns(HARMONICS)], axis=2)
-    scaled = jacobian * block.sigma
+    scaled = jacobian * by_block[HARMONICS]
     values, vectors = np.linalg.eigh(gram(scaled, weights @ scaled))
     # Least ratio of data to prior information of combinations that are unknowns; others keep their
     # prior.
     determined = vectors[:, values > 0.05]
-    basis = np.concatenate([share * second.basis, block.basis], axis=2)
-    errors[HARMONICS] = replace(block, basis=basis @ determined)
     joints, orders = waves.expanded.shape[:2]
     of_second = np.zeros((joints, orders, 2, 2 * joints))
     of_second[:, 0] = share * np.eye(2 * joints).reshape(joints, 2, -1)
@@ -325,4 +323,4 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
         waves.length_rad,
         2.0 * (rest.most_likely(logs).value - best.value),
     )
-    return ArmSizes(errors, levels, gain, functions)
+    return arm.model.with_errors(by_block, yielding, functions), levels, gain

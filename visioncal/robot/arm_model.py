@@ -12,7 +12,7 @@ from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot import Loads, Robot
 from visioncal.robot.elasticity import WeightFunctions, deflected_joints
-from visioncal.robot.errors import TWIST_UNITS, ArmErrors
+from visioncal.robot.errors import TWIST_UNITS
 
 # Columns of a joint's function (see `Robot.function_jacobian`) by block.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
@@ -57,6 +57,7 @@ class ArmModel:
     # Bending functions of unknown link masses; None where masses are known.
     functions: WeightFunctions | None = None
     waves: JointFunctions | None = None  # Functions of the joints; None without any.
+    error_rad: float = 1.0  # Standard deviation of the values [rad].
 
     @classmethod
     def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
@@ -79,22 +80,20 @@ class ArmModel:
         return replace(self, torque_nm=greatest or 1.0)
 
     def with_errors(
-        self, errors: Mapping[str, ArmErrors], functions: JointFunctions | None = None
+        self,
+        sizes: Mapping[str, float],
+        yielding: Mask | None,
+        functions: JointFunctions | None = None,
     ) -> "ArmModel":
-        """Returns the arm with error blocks to be estimated, all zero.
+        """Returns the arm with error blocks to be estimated, all zero, by their sizes [rad].
 
-        `functions` are those of the joints, where `harmonics` is among the blocks.
+        `yielding` are the joints that bend, where `compliance` is among the blocks, and `functions`
+        those of the joints, where `harmonics` is.
         """
-        count = sum(error.basis.shape[2] for error in errors.values())
-        first = next(iter(errors.values())).sigma
-        compliance = errors.get(COMPLIANCE)
-        return replace(
-            self,
-            weights={name: error.sigma / first for name, error in errors.items()},
-            values=np.zeros(count),
-            yielding=None if compliance is None else np.any(compliance.basis, axis=(0, 1)) > 0,
-            waves=functions,
-        )
+        first = next(iter(sizes.values()))
+        weights = {name: size / first for name, size in sizes.items()}
+        arm = replace(self, weights=weights, error_rad=first, yielding=yielding, waves=functions)
+        return replace(arm, values=np.zeros(sum(map(arm.size_of, weights))))
 
     def moved(self, step: FloatArray) -> "ArmModel":
         """Returns the arm after a (p,) step of its values."""

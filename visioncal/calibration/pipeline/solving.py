@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.inliers import initial_inliers, updated_inliers, with_repeats
 from visioncal.calibration.pipeline.starting import Start, find_start
-from visioncal.calibration.stages.arms import Arm, arm_effects, check_arms, with_link_errors
+from visioncal.calibration.stages.arms import Arm, arm_effects, with_link_errors
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
@@ -26,7 +26,11 @@ from visioncal.calibration.stages.error_sizes import (
     measured_errors,
 )
 from visioncal.calibration.stages.handeye import closed_form_state
-from visioncal.calibration.stages.kinematics import check_level_is_possible
+from visioncal.calibration.stages.kinematics import (
+    check_arms,
+    check_level_is_possible,
+    with_likely_errors,
+)
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.random_effects import random_effects
 from visioncal.calibration.stages.refine import refine_jointly
@@ -360,13 +364,14 @@ def _choose_levels(cell_fit: CellFit, noise: Noise, *, functions: bool = False) 
     views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
 
     def with_level(arm: Arm, nominal: Problem, start: State) -> Arm:
-        found = arm.with_level(nominal, start, cell_fit.level, views, noise, functions=functions)
+        level = cell_fit.level
+        found = with_likely_errors(arm, nominal, start, level, noise, views, functions=functions)
         if not functions:
             return found
         # They also explain much of a slipped joint: where the slip explains more, they are left
         # out.
-        by_joint = None if found.kinematics is None else found.kinematics.fit.functions
-        if by_joint is None or not (gain := by_joint.gain):
+        waves = None if found.model is None else found.model.waves
+        if waves is None or not (gain := waves.gain):
             return arm
         joints = joints_of(fit.problem, joint_offsets({arm.robot: arm}))
         slips = any(step.gain > gain for step in find_steps(fit.problem, fit.solution, joints))

@@ -8,7 +8,6 @@ import numpy as np
 
 from visioncal.calibration.stages import elastic
 from visioncal.calibration.stages.arms import Arm
-from visioncal.calibration.stages.kinematics import SelectedArmLevel
 from visioncal.calibration.stages.thermal import drift_result
 from visioncal.core.choices import Convention
 from visioncal.core.number_format import figure, some_of
@@ -76,7 +75,7 @@ def report_of(
         convention: Convention of the arm's table; see `add_parameters`.
     """
     data, levels, found = arm.data(fit, middles), arm.kinematics, ArmReport()
-    sections = ArmSections(arm=None if levels is None else levels.result)
+    sections = ArmSections(arm=levels)
     if data is not None and levels is not None:
         found = _calibrated(data, levels, convention)
         sections = found.sections
@@ -88,11 +87,12 @@ def report_of(
     return replace(found, sections=sections)
 
 
-def _calibrated(arm: ArmData, levels: SelectedArmLevel, convention: Convention | None) -> ArmReport:
+def _calibrated(arm: ArmData, levels: ArmResult, convention: Convention | None) -> ArmReport:
     """Findings about a calibrated arm."""
     model, notes = arm.model, list[str]()
     result = replace(
-        levels.result,
+        levels,
+        left_out=(),
         robot=model.robot,
         backlash=elastic.plays_of(model, arm.arm_covariance),
         measured=tuple(
@@ -104,9 +104,9 @@ def _calibrated(arm: ArmData, levels: SelectedArmLevel, convention: Convention |
     # With backlash and compliance alone the table stays nominal.
     if model.weights.keys() & set(RIGID):
         result, advice, mistyped = add_parameters(result, arm, convention)
-        result = replace(result, left_out=levels.left_out())
+        result = replace(result, left_out=levels.left_out)
         notes += [*far_off(result.parameters, model.nominal), *([advice] if advice else [])]
-    springs = elastic.elastic_of(arm, levels.fit.errors)
+    springs = elastic.elastic_of(arm)
     notes += () if springs is None else elastic.remarks(springs)
     doubts = [*mistyped, *elastic.play_findings(result.backlash)]
     doubts += () if springs is None else elastic.doubts(springs)

@@ -8,31 +8,24 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration.stages.joints import MatchedJoints
-from visioncal.calibration.stages.kinematics import (
-    ASKED,
-    LevelFit,
-    SelectedArmLevel,
-    select_errors,
-)
-from visioncal.core.errors import DataError
 from visioncal.core.limits import DETERMINED
 from visioncal.core.transforms import distances, exp, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.arm import arm_effect, find_arm_errors, rows_of, stops_of
-from visioncal.estimation.arm_sizes import most_orders
+from visioncal.estimation.arm import arm_effect, find_arm_errors, stops_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.estimation.unknowns import ARM, EDGE
 from visioncal.model import Moments
 from visioncal.model.arm import even_progress, sides_of_motion
 from visioncal.model.effects.heat import Heat
 from visioncal.model.heating import recorded_inputs
+from visioncal.results.arm import ArmResult
 from visioncal.robot import Loads, Robot
-from visioncal.robot.arm_model import HARMONICS, ArmModel, blocks_of
+from visioncal.robot.arm_model import ArmModel
 from visioncal.robot.errors import SIGNIFICANT, ArmErrors, link_basis, pose_basis
 from visioncal.robot.thermal import Inputs, ThermalModel
 from visioncal.session import Session, View
@@ -112,7 +105,7 @@ class Arm:
     thermal: Drift | None = None
     errors: ArmErrors | None = None  # Posture-dependent errors, where they are likely.
     # Compared levels; None where none were requested or possible.
-    kinematics: SelectedArmLevel | None = None
+    kinematics: ArmResult | None = None
     # Arm with the errors of the chosen level; None for a nominal arm.
     model: ArmModel | None = None
 
@@ -302,72 +295,6 @@ class Arm:
         model = self.model or nominal
         return model.columns("offsets", self.joints_rad, self.loads)
 
-    def with_level(
-        self,
-        problem: Problem,
-        start: State,
-        level: str,
-        views: Sequence[int],
-        noise: Noise,
-        *,
-        functions: bool = False,
-        nominal: LevelFit | None = None,
-    ) -> Self:
-        """Selects the errors of the arm's model by the data; see `select_errors`.
-
-        The problem has this arm as reported; `views` has the view of each observation. With
-        `functions` those of the joints are among them; where none are significant, the arm stays.
-        `nominal` is the fit of the nominal arm, where it is known.
-        """
-        used = self.at(stops_of(problem, self.robot))
-        q, every = used.joints_rad, self.joints_rad
-        if q is None or every is None or not len(q):
-            return self
-        # Fewest stops for functions of the joints.
-        if functions and (HARMONICS not in ASKED[level] or len(q) < 20):
-            return self
-        found_levels = []
-        for robot in self._hypotheses(used.loads):
-            model = ArmModel.of(robot, q, used.reported).loaded(q, used.loads)
-            bases = {
-                name: model.columns(name, every, self.loads)
-                for name in blocks_of(model.nominal, self.loads)
-            }
-            waves = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
-            kinematics = select_errors(
-                problem, start, self.robot, bases, model.torque_nm, level, noise, waves, nominal
-            )
-            if kinematics is not None:
-                found_levels.append((kinematics, model))
-                nominal = kinematics.nominal
-        if not found_levels:
-            return self
-        kinematics, model = max(found_levels, key=lambda pair: pair[0].fit.gain)
-        arm_rows = np.flatnonzero(rows_of(problem, self.robot)).tolist()
-        kinematics = replace(kinematics, views=tuple(views[index] for index in arm_rows))
-        arm = replace(self, kinematics=kinematics)
-        if found := kinematics.fit.errors:
-            return arm._with_model(model.with_errors(found, kinematics.fit.functions))
-        if self.model is None:
-            return arm
-        # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
-        fit = kinematics.nominal.fit
-        likelihood = robot_likelihood(problem, fit.state, fit.noise)
-        return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
-
-    def _hypotheses(self, loads: Loads) -> Iterator[Robot]:
-        """The arm as stated; where loads could show it, also with its weight compensated."""
-        if self.nominal is None:
-            return
-        # Of functions of the joints only that arm is tried which the loads have shown.
-        shown = None if self.model is None else self.model.nominal.weight_compensated
-        stated = self.nominal
-        is_testable = stated.masses is not None and loads.any and not stated.weight_compensated
-        if not (shown and is_testable):
-            yield stated
-        if shown is not False and is_testable:
-            yield stated.with_weight_compensated
-
     def relinearised(self, fit: Fit) -> tuple[Self, float]:
         """Relinearises the calibrated arm at a fit.
 
@@ -377,14 +304,15 @@ class Arm:
         step = fit.values((ARM, self.robot))
         if self.model is None or not len(step):
             return self, 0.0
-        return self._with_model(self.model.moved(step)), float(np.abs(step).max())
+        return self.with_model(self.model.moved(step)), float(np.abs(step).max())
 
-    def _with_model(self, model: ArmModel) -> Self:
+    def with_model(self, model: ArmModel) -> Self:
         """The arm with a calibrated model, and its errors linearised there."""
         if self.kinematics is None:
             return self
-        arm, first = replace(self, model=model), next(iter(self.kinematics.fit.errors.values()))
-        return replace(arm, errors=replace(first, basis=arm.basis))
+        arm, gain = replace(self, model=model), self.kinematics.chosen.likelihood_ratio
+        errors = ArmErrors(arm.basis, model.error_rad, gain, of_links=True)
+        return replace(arm, errors=errors)
 
 
 def arm_effects(arms: Mapping[str, Arm]) -> Iterator[Effect]:
@@ -402,21 +330,3 @@ def with_link_errors(arms: Mapping[str, Arm], fit: Fit) -> dict[str, Arm]:
         else arm.with_errors(likelihood, fit.problem.robots.index(name))
         for name, arm in arms.items()
     }
-
-
-def check_arms(arms: Mapping[str, Arm], level: str) -> None:
-    """Refuses a level that the loads cannot give.
-
-    Raises:
-        DataError: Compliance is requested, and no load bends the joints.
-    """
-    for arm in arms.values():
-        robot = arm.nominal
-        if level == "elastic" and robot and robot.masses is None and not arm.loads.any:
-            raise DataError(
-                f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does "
-                "not state the masses of its links, and no view has a payload_kg or a force.",
-                culprits=["level", robot.name],
-                next_step="Add mass_kg and com_m to each [[joint]] of its table, take its URDF, or "
-                "record payload_kg (with payload_x_m, payload_y_m, payload_z_m) with every view.",
-            )

@@ -15,26 +15,20 @@ from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag, TwoSlopes
 from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.robot.elasticity import BENDS, BY_CONTROLLER, OF_MASSES, SOFT, weight_words
-from visioncal.robot.errors import ArmErrors
 from visioncal.robot.loads import STANDARD_GRAVITY_M_S2, load_ranges
 
 
-def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult | None:
-    """Estimated springs of an arm, with its loads and deflections; None for a rigid one.
-
-    Args:
-        arm: The observations of the arm.
-        errors: Its errors with prior sizes, by block.
-    """
-    if not errors.keys() & {COMPLIANCE, WEIGHT}:
+def elastic_of(arm: ArmData) -> ElasticResult | None:
+    """Estimated springs of an arm, with its loads and deflections; None for a rigid one."""
+    if not arm.model.weights.keys() & {COMPLIANCE, WEIGHT}:
         return None
     model, loads, names = arm.model, arm.loads, arm.model.nominal.joint_names
     torques = model.robot.load_torques(model.bent(arm.q, loads), loads)
     sigmas, prior = np.zeros(len(names)), 0.0
-    if COMPLIANCE in errors:
-        prior = errors[COMPLIANCE].sigma / model.torque_nm
-        variances = np.diag(arm.arm_covariance)[model.columns_of(COMPLIANCE)]
+    if COMPLIANCE in model.weights:
         unit = model.weights[COMPLIANCE] / model.torque_nm
+        prior = unit * model.error_rad
+        variances = np.diag(arm.arm_covariance)[model.columns_of(COMPLIANCE)]
         sigmas = np.minimum(unit * np.sqrt(variances), prior)
     determined = sigmas < DETERMINED * prior
     is_stiff = determined & (model.compliance > CONTRADICTION * sigmas)

@@ -3,22 +3,32 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
+from visioncal.calibration.stages.arms import Arm
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import arm_effect, rows_of, stops_of
-from visioncal.estimation.arm_sizes import ArmSizes, estimate_arm_sizes
+from visioncal.estimation.arm_sizes import SizedArm, estimate_arm_sizes, most_orders
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals
 from visioncal.results.arm import FUNCTIONS, NOMINAL, ArmLevel, ArmResult, UnseenView
-from visioncal.robot.arm_model import BACKLASH, COMPLIANCE, HARMONICS, RIGID, WEIGHT, JointFunctions
+from visioncal.robot import Loads, Robot
+from visioncal.robot.arm_model import (
+    BACKLASH,
+    COMPLIANCE,
+    HARMONICS,
+    RIGID,
+    WEIGHT,
+    ArmModel,
+    blocks_of,
+)
 from visioncal.robot.errors import ArmErrors
 
 # The blocks of errors by what the user asks for: the quick one after a lost encoder, or all that
@@ -42,159 +52,177 @@ _LEVEL_OF = {
     WEIGHT: "elastic",
     HARMONICS: FUNCTIONS,
 }
+# Units of residuals that are reported.
+_DEG_MM: FloatArray = np.array([np.rad2deg(1.0), 1e3])
 
 
 @dataclass(frozen=True, eq=False)
-class LevelFit:
-    """Fit with some blocks of errors of a robot's arm free."""
+class _Trial:
+    """A fit with some errors of an arm's model free, or of the nominal arm."""
 
     fit: Solution
-    # (m, 2, 2) squared lengths of rotation [rad^2] and translation [m^2] of the residuals of the
-    # robot's observations, in the fit and to first order without the observation's stop.
-    squares: FloatArray
-    has_rotation: Mask  # (m,) which observations include a rotation.
-    errors: Mapping[str, ArmErrors]  # The errors by block; empty for the nominal arm.
-    gain: float  # Twice the gain in log-likelihood over the nominal arm.
-    functions: JointFunctions | None  # Functions of the joints; None without any.
+    figures: ArmLevel
+    # (m, 2) residuals of the robot's observations, to first order without the stop of each:
+    # rotation [deg], NaN where none was observed, and position [mm].
+    left_out: FloatArray
+    model: ArmModel | None  # The arm with these errors; None for the nominal one.
 
     @classmethod
     def of(
-        cls, problem: Problem, state: State, robot: str, noise: Noise, sizes: ArmSizes | None
-    ) -> "LevelFit":
-        """Fits all unknowns with errors of some sizes; the nominal arm where `sizes` is None."""
-        errors = {} if sizes is None else sizes.errors
-        if sizes is not None:
-            effects = [arm_effect(error, robot, name) for name, error in errors.items()]
-            problem = problem.with_effects([*problem.effects, *effects])
-            noise = replace(noise, robots=sizes.levels)
+        cls, problem: Problem, state: State, noise: Noise, arm: Arm, sized: SizedArm | None
+    ) -> "_Trial":
+        """Fits all unknowns with errors of some sizes; those of the nominal arm where None."""
+        model, gain, unknowns, names = None, 0.0, 0, [NOMINAL]
+        if sized is not None:
+            model, levels, gain = sized
+            effects, q = list(problem.effects), arm.moments.joints[arm.robot]
+            for name, weight in model.weights.items():
+                basis, size = model.columns(name, q, arm.loads), weight * model.error_rad
+                errors = ArmErrors(basis, size, gain, of_links=True)
+                effects.append(arm_effect(errors, arm.robot, name))
+            problem, unknowns = problem.with_effects(effects), len(model.values)
+            noise = replace(noise, robots=levels)
+            names = [level for block, level in _LEVEL_OF.items() if block in model.weights]
         values = np.append(state.values, problem.start_values[len(state.values) :])
         fit = fit_problem(problem, State(state.edges, values), noise)
-        rows, seen = rows_of(problem, robot), problem.observations
-        residuals = [
-            problem.linear(fit.state).residuals[rows],
-            left_out_residuals(problem, fit.state, fit.noise, rows)[rows],
-        ]
-        squares = np.sum(np.stack(residuals, axis=1).reshape(-1, 2, 2, 3) ** 2, axis=3)
-        is_point = np.array([name in problem.points for name in seen.observed], dtype=bool)
-        has_rotation = seen.has_rotation & ~is_point
-        gain, functions = (0.0, None) if sizes is None else (sizes.gain, sizes.functions)
-        return cls(fit, squares, has_rotation[rows], errors, gain, functions)
-
-    @cached_property
-    def result(self) -> ArmLevel:
-        """The fit as figures."""
-        names = [level for block, level in _LEVEL_OF.items() if block in self.errors]
-        inside_mm, held_out_mm = (1e3 * np.sqrt(self.squares[:, :, 1].mean(axis=0))).tolist()
-        turned, degs = self.squares[self.has_rotation, :, 0], (None, None)
-        if len(turned):
-            degs = tuple(np.rad2deg(np.sqrt(turned.mean(axis=0))).tolist())
-        return ArmLevel(
-            level=names[-1] if names else NOMINAL,
-            unknowns=sum(error.basis.shape[2] for error in self.errors.values()),
-            rms_mm=inside_mm,
-            rms_deg=degs[0],
-            held_out_mm=held_out_mm,
-            held_out_deg=degs[1],
-            likelihood_ratio=self.gain,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class SelectedArmLevel:
-    """The errors of the arm's model that the views show."""
-
-    nominal: LevelFit  # The fit of the nominal arm.
-    fit: LevelFit  # The fit with the errors; the nominal one where none explain more than chance.
-    requested: str  # The level that was requested.
-    views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
-
-    @property
-    def level(self) -> str:
-        """Name of the level; `nominal` where no errors explain more than chance."""
-        return self.fit.result.level
-
-    def left_out(self) -> tuple[UnseenView, ...]:
-        """Residuals of held-out stops with both arms, by view."""
-        scale = np.array([np.rad2deg(1.0), 1e3])
-        before, after = (
-            (np.sqrt(level.squares[:, 1]) * scale).tolist() for level in (self.nominal, self.fit)
-        )
-        columns = zip(self.views, before, after, self.nominal.has_rotation, strict=True)
-        return tuple(
-            UnseenView(
-                view=view,
-                nominal_mm=was_mm,
-                mm=now_mm,
-                nominal_deg=was_deg if has_rotation else None,
-                deg=now_deg if has_rotation else None,
+        rows, seen = rows_of(problem, arm.robot), problem.observations
+        inside, held_out = (
+            np.linalg.norm(residuals[rows].reshape(-1, 2, 3), axis=2) * _DEG_MM
+            for residuals in (
+                problem.linear(fit.state).residuals,
+                left_out_residuals(problem, fit.state, fit.noise, rows),
             )
-            for view, (was_deg, was_mm), (now_deg, now_mm), has_rotation in columns
         )
+        is_point = np.array([name in problem.points for name in seen.observed], dtype=bool)
+        turned = (seen.has_rotation & ~is_point)[rows]
+        rms_deg, held_out_deg = (
+            float(np.sqrt(np.mean(array[turned, 0] ** 2))) if turned.any() else None
+            for array in (inside, held_out)
+        )
+        rms_mm, held_out_mm = (
+            float(np.sqrt(np.mean(array[:, 1] ** 2))) for array in (inside, held_out)
+        )
+        held_out[~turned, 0] = np.nan
+        figures = ArmLevel(
+            level=names[-1],
+            unknowns=unknowns,
+            rms_mm=rms_mm,
+            rms_deg=rms_deg,
+            held_out_mm=held_out_mm,
+            held_out_deg=held_out_deg,
+            likelihood_ratio=gain,
+        )
+        return cls(fit, figures, held_out, model)
 
-    @cached_property
-    def result(self) -> ArmResult:
-        """Both levels, as a section of a calibration."""
-        fits = (self.nominal,) if self.fit is self.nominal else (self.nominal, self.fit)
-        return ArmResult(level=self.level, levels=tuple(fit.result for fit in fits))
 
-
-def select_errors(
+def with_likely_errors(
+    arm: Arm,
     problem: Problem,
     state: State,
-    robot: str,
-    bases: Mapping[str, FloatArray],
-    torque_nm: float,
     level: str,
     noise: Noise,
-    harmonics: FloatArray | None,
-    nominal: LevelFit | None = None,
-) -> SelectedArmLevel | None:
-    """Selects the errors of a robot's arm that its observations show.
+    views: Sequence[int],
+    *,
+    functions: bool = False,
+    stated: Sequence[Robot] = (),
+) -> Arm:
+    """The arm with the errors of its model that its observations show.
 
     The errors' sizes are estimated together; see `arm_sizes`. An arm with such errors must also
     predict left-out stops better than the nominal arm.
 
     Args:
-        problem: The observations, without errors of this arm.
+        arm: The arm.
+        problem: The observations, with this arm as reported.
         state: The solution with the nominal arm.
-        robot: The robot.
-        bases: (s, 6, p) Jacobian of the flange pose by stop, for the errors of each block.
-        torque_nm: The torque of a unit compliance [N m].
         level: A key of `ASKED`.
         noise: The noise's levels to start from.
-        harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
-        nominal: The fit of the nominal arm, where it is known.
-
-    Returns:
-        The errors; with `harmonics` None where no functions of the joints are significant.
+        views: (n,) the view of each observation.
+        functions: Whether functions of the joints are among the errors; where none are significant,
+            the arm stays.
+        stated: Models, of which the likeliest is taken, in place of the arm's own.
     """
-    is_enough = len(stops_of(problem, robot)) >= FEWEST_STOPS
-
-    def likely(blocks: Sequence[str]) -> ArmSizes | None:
-        block_bases = {name: basis for name, basis in bases.items() if name in blocks}
-        waves = harmonics if HARMONICS in blocks else None
-        with suppress(np.linalg.LinAlgError):
-            if is_enough:
-                return estimate_arm_sizes(
-                    problem, state, noise, robot, block_bases, torque_nm, waves
-                )
-        return None
-
-    def fitted(sizes: ArmSizes | None, nominal: LevelFit) -> LevelFit:
-        """The fit with errors of some sizes; the nominal one where it is no better."""
-        with suppress(np.linalg.LinAlgError):
-            fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else nominal
-            return fit if fit.result.held_out_mm < nominal.result.held_out_mm else nominal
-        return nominal
-
+    used = arm.at(stops_of(problem, arm.robot))
+    q, nominal, best = used.joints_rad, None, None
+    # Fewest stops for functions of the joints.
+    if q is None or not len(q) or (functions and (HARMONICS not in ASKED[level] or len(q) < 20)):
+        return arm
     # Numbers may be so large that their squares are none.
     with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
-        sizes = likely(ASKED[level])
-        if harmonics is not None and sizes is None:
-            return None
-        nominal = nominal or LevelFit.of(problem, state, robot, noise, None)
-        fit = fitted(sizes, nominal)
-    return SelectedArmLevel(nominal, fit, level)
+        for robot in _hypotheses(arm, used.loads, stated):
+            model = ArmModel.of(robot, q, used.reported).loaded(q, used.loads)
+            sized = _sized(arm, model, problem, state, noise, level, functions=functions)
+            if functions and sized is None:
+                continue
+            nominal = trial = nominal or _Trial.of(problem, state, noise, arm, None)
+            if sized is not None:
+                with suppress(np.linalg.LinAlgError):
+                    found = _Trial.of(problem, state, noise, arm, sized)
+                    is_better = found.figures.held_out_mm < nominal.figures.held_out_mm
+                    trial = found if is_better else nominal
+            if best is None or trial.figures.likelihood_ratio > best.figures.likelihood_ratio:
+                best = trial
+    if nominal is None or best is None:
+        return arm
+    levels = [trial.figures for trial in dict.fromkeys((nominal, best))]
+    rows = np.flatnonzero(rows_of(problem, arm.robot)).tolist()
+    unseen = _unseen([views[row] for row in rows], nominal, best) if len(levels) > 1 else ()
+    result = ArmResult(level=best.figures.level, levels=tuple(levels), left_out=tuple(unseen))
+    chosen = replace(arm, kinematics=result)
+    if best.model is not None:
+        return chosen.with_model(best.model)
+    if arm.model is None:
+        return chosen
+    # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
+    likelihood = robot_likelihood(problem, nominal.fit.state, nominal.fit.noise)
+    return replace(chosen, model=None).with_errors(likelihood, problem.robots.index(arm.robot))
+
+
+def _hypotheses(arm: Arm, loads: Loads, stated: Sequence[Robot]) -> Iterator[Robot]:
+    """The arm as stated; where loads could show it, also with its weight compensated."""
+    # Of functions of the joints only that arm is tried which the loads have shown.
+    shown = None if arm.model is None else arm.model.nominal.weight_compensated
+    for robot in stated or ([] if arm.nominal is None else [arm.nominal]):
+        is_testable = robot.masses is not None and loads.any and not robot.weight_compensated
+        if not (shown and is_testable):
+            yield robot
+        if shown is not False and is_testable:
+            yield robot.with_weight_compensated
+
+
+def _sized(
+    arm: Arm,
+    model: ArmModel,
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    level: str,
+    *,
+    functions: bool,
+) -> SizedArm | None:
+    """Errors of a model with their sizes; None where none are likely, or there are few stops."""
+    if arm.joints_rad is None or len(stops_of(problem, arm.robot)) < FEWEST_STOPS:
+        return None
+    bases = {
+        name: model.columns(name, arm.joints_rad, arm.loads)
+        for name in blocks_of(model.nominal, arm.loads)
+        if name in ASKED[level]
+    }
+    waves = None
+    if functions:
+        waves = model.robot.harmonic_jacobian(arm.joints_rad, most_orders())
+    with suppress(np.linalg.LinAlgError):
+        return estimate_arm_sizes(problem, state, noise, arm.robot, model, bases, waves)
+    return None
+
+
+def _unseen(views: Sequence[int], nominal: _Trial, chosen: _Trial) -> Iterator[UnseenView]:
+    """Residuals of left-out stops with both arms, by view."""
+    rows = np.concatenate([nominal.left_out, chosen.left_out], axis=1).tolist()
+    for view, (was_deg, was_mm, now_deg, now_mm) in zip(views, rows, strict=True):
+        of_places = UnseenView(view=view, nominal_mm=was_mm, mm=now_mm)
+        is_turned = not np.isnan(was_deg)
+        yield replace(of_places, nominal_deg=was_deg, deg=now_deg) if is_turned else of_places
 
 
 def check_level(level: str) -> None:
@@ -226,23 +254,42 @@ def check_level_is_possible(level: str, *, can: bool, misread: str = "") -> None
         )
 
 
-def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
+def check_arms(arms: Mapping[str, Arm], level: str) -> None:
+    """Refuses a level that the loads cannot give.
+
+    Raises:
+        DataError: Compliance is requested, and no load bends the joints.
+    """
+    for arm in arms.values():
+        robot = arm.nominal
+        if level == "elastic" and robot and robot.masses is None and not arm.loads.any:
+            raise DataError(
+                f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does "
+                "not state the masses of its links, and no view has a payload_kg or a force.",
+                culprits=["level", robot.name],
+                next_step="Add mass_kg and com_m to each [[joint]] of its table, take its URDF, or "
+                "record payload_kg (with payload_x_m, payload_y_m, payload_z_m) with every view.",
+            )
+
+
+def findings(arm: Arm, requested: str) -> Iterator[str]:
     """States the chosen level, for the verdict."""
-    if kinematics.level == NOMINAL and kinematics.requested not in ("auto", "thermal"):
+    result = arm.kinematics
+    if result is None:
+        return
+    if not result.is_calibrated and requested not in ("auto", "thermal"):
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
         )
-    elif (
-        kinematics.requested == "elastic"
-        and not {COMPLIANCE, WEIGHT} & kinematics.fit.errors.keys()
+    elif requested == "elastic" and not (
+        arm.model is not None and {COMPLIANCE, WEIGHT} & arm.model.weights.keys()
     ):
         yield (
             "No joint was found to bend under load, as asked: what else the arm errs by explains "
             "the views as well. State payload_kg in views.csv, and record stops with and "
             "without it."
         )
-    result = kinematics.result
     if result.is_calibrated:
         yield (
             f"The arm was calibrated along ({result.level}): stops left out are predicted to "

@@ -30,11 +30,10 @@ def _found(run: RunState) -> Iterator[Finding]:
     arms, reports = run.cell_fit.arms, run.assessment.arms
     for name, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
-        levels = () if arm.kinematics is None else (*findings(arm.kinematics),)
         mounting = other_mounting(run, arm)
         # Encoders, zeros and springs are those of an arm that is mounted otherwise.
         found = () if mounting is not None else reports[name].notes
-        notes = remarks((*drifts, *levels, *found), NOTE)
+        notes = remarks((*drifts, *findings(arm, run.cell_fit.level), *found), NOTE)
         stops = len(stops_of(run.assessment.fit.problem, name))
         arm_findings = (*([mounting] if mounting else []), *_of(arm, run.cell_fit.level, stops))
         for finding in (*arm_findings, *reports[name].doubts, *notes):

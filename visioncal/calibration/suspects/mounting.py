@@ -8,7 +8,7 @@ from visioncal.calibration.pipeline.arm_results import change_each
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import robot_key
-from visioncal.calibration.stages.kinematics import LevelFit, SelectedArmLevel
+from visioncal.calibration.stages.kinematics import with_likely_errors
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
@@ -40,19 +40,16 @@ def other_mounting(run: RunState, arm: Arm) -> Finding | None:
         return None
     home = np.zeros((1, known.joint_count))
     moved = (known.base_from_flange(home) @ invert(declared.base_from_flange(home)))[0]
-    tried = list[tuple[SelectedArmLevel, FloatArray]]()
     size = float(np.linalg.norm(declared.gravity))
-    for axis in size * np.concatenate([np.eye(3), -np.eye(3)]):
-        is_stated = axis @ declared.gravity > 0.9 * size**2
-        nominal = tried[0][0].nominal if tried else None
-        level = None if is_stated else _level(run, arm, moved[:3, :3] @ axis, nominal)
-        if level is not None:
-            tried.append((level, axis))
-    if not tried:
+    axes = size * np.concatenate([np.eye(3), -np.eye(3)])
+    others = axes[axes @ declared.gravity <= 0.9 * size**2]
+    found = _with_gravity(run, arm, known, others @ moved[:3, :3].T)
+    if found.kinematics is None or found.model is None:
         return None
-    level, axis = max(tried, key=lambda pair: pair[0].fit.gain)
-    gain = level.fit.gain - kinematics.fit.gain
-    before_mm, after_mm = (at.fit.result.held_out_mm for at in (kinematics, level))
+    axis = size * np.round(moved[:3, :3].T @ found.model.nominal.gravity / size)
+    chosen, likelier = kinematics.chosen, found.kinematics.chosen
+    gain = likelier.likelihood_ratio - chosen.likelihood_ratio
+    before_mm, after_mm = chosen.held_out_mm, likelier.held_out_mm
     if gain < _CLEAR or CLEAR_RATIO * after_mm > before_mm:
         return None
     line = f"gravity_m_s2 = {gravity_words(axis)}"
@@ -68,24 +65,22 @@ def other_mounting(run: RunState, arm: Arm) -> Finding | None:
     )
 
 
-def _level(
-    run: RunState, arm: Arm, gravity: FloatArray, nominal_fit: LevelFit | None
-) -> SelectedArmLevel | None:
-    """The errors of an arm with (3,) gravity in the base of its poses [m/s^2]."""
+def _with_gravity(run: RunState, arm: Arm, robot: Robot, directions: FloatArray) -> Arm:
+    """The arm with its errors at the likeliest of (k, 3) gravities in the base of its poses."""
     cell_fit = run.cell_fit
+    robots = [
+        replace(robot, document={**robot.document, "gravity_m_s2": at.tolist()}, gravity=at)
+        for at in directions
+    ]
 
-    def with_gravity(other: Arm, nominal: Problem, start: State) -> Arm:
-        robot = other.nominal
-        if other.robot != arm.robot or robot is None:
+    def changed(other: Arm, problem: Problem, start: State) -> Arm:
+        if other.robot != arm.robot:
             return other
-        document = {**robot.document, "gravity_m_s2": gravity.tolist()}
-        robot = replace(robot, document=document, gravity=gravity)
-        other = replace(other, nominal=robot, model=None)
-        return other.with_level(
-            nominal, start, cell_fit.level, run.used, cell_fit.noise, nominal=nominal_fit
-        )
+        other, level = replace(other, model=None, kinematics=None), cell_fit.level
+        noise, views = cell_fit.noise, run.used
+        return with_likely_errors(other, problem, start, level, noise, views, stated=robots)
 
-    return change_each(cell_fit.arms, cell_fit.fit, with_gravity)[arm.robot].kinematics
+    return change_each(cell_fit.arms, cell_fit.fit, changed)[arm.robot]
 
 
 # Its misfit goes into encoders, links and scatter, and puts some views far off.
