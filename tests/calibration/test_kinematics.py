@@ -67,7 +67,8 @@ TOOL = exp(np.array([0.1, 0.0, 0.2, 0.01, 0.02, 0.1]))
 def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     """What is seen of an arm that is as stated."""
     sizes = sum(SIZES[index] for index in blocks) * robot.joint_count
-    model = ArmModel(robot, TOOL, dict.fromkeys(blocks, 1.0), np.zeros(sizes))
+    weights = dict.fromkeys(blocks, 1.0)
+    model = ArmModel(robot, TOOL, weights, np.zeros(sizes), error_rad=ERROR_RAD)
     poses = model.robot.base_from_flange(q)
     effect = arm_effect(ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True), ROBOT)
     covariance = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
@@ -78,13 +79,9 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
         Fit(problem, Solution(state, NOISE)),
         ROBOT,
         model,
-        ERROR_RAD,
-        np.arange(len(q)),
         q,
         Loads.alike(len(q), 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        np.zeros(3),
-        np.arange(12),
-        np.ones(6, dtype=bool),
+        {},
     )
 
 
@@ -308,7 +305,7 @@ def test_readings_of_one_point_determine_three_values_fewer(name):
     arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
     places = replace(arm.fit.problem.observations, has_rotation=np.zeros(60, dtype=bool))
     fit = replace(arm.fit, problem=replace(arm.fit.problem, observations=places))
-    positions = replace(arm, fit=fit, measured=np.arange(6) > 2)
+    positions = replace(arm, fit=fit)
     whole, point = (identified(data)[0].observability for data in (arm, positions))
     assert (point.identifiable, point.determined) == (whole.identifiable - 3, whole.determined - 3)
 

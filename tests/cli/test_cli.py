@@ -32,7 +32,6 @@ from typer.main import get_command
 
 import visioncal as visioncal_package
 from visioncal.calibration.run import STAGES
-from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import dynamics, progress
 from visioncal.cli.app import app, main
 from visioncal.cli.libraries import SmallLibraries
@@ -46,6 +45,7 @@ from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.planning.purposes import PURPOSES
 from visioncal.results import Calibration
 from visioncal.results.history import History
+from visioncal.robot.arm_model import LEVELS
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, write_session
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
@@ -100,7 +100,7 @@ def test_help_has_every_word_within_the_terminal(columns):
 
 
 CHOICES = {
-    "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName)},
+    "calibrate": {"level": LEVELS, "solver": get_args(SolverName)},
     "plan": {"purpose": PURPOSES, "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS)},
     "simulate": {"robot": SIMULATED_ARMS},

@@ -30,10 +30,9 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.robot.arm_model import (
-    BACKLASH,
     COMPLIANCE,
+    GROUPS,
     HARMONICS,
-    WEIGHT,
     ArmModel,
     JointFunctions,
 )
@@ -47,21 +46,8 @@ _LENGTHS_RAD, _CARRIED, _WORSE = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0, 2
 _SHOWN = 5.0
 # Harmonics of order 2 of each joint.
 _SECOND = "second"
-# Typical sizes of errors [rad], with a log-normal prior of a factor of e; that of a compliance is
-# for 10 N m.
-_TYPICAL = {
-    "links": 7e-4,
-    "offsets": 7e-4,
-    COMPLIANCE: 1e-4,
-    WEIGHT: 1e-4,
-    BACKLASH: 1e-4,
-    "ratios": 1e-4,
-    "eccentricity": 1.5e-4,
-    _SECOND: 1e-4,
-    HARMONICS: 2e-4,
-}
-
-
+# Typical sizes of errors [rad], with a log-normal prior of a factor of e.
+_TYPICAL = {_SECOND: 1e-4} | {name: group.usual_rad for name, group in GROUPS.items()}
 # The arm with all blocks of errors but those of size zero, (r, 2) levels of robots' noise beside
 # these (see `Noise`), and twice the gain in log-likelihood over the nominal arm.
 SizedArm: TypeAlias = tuple[ArmModel, FloatArray, float]

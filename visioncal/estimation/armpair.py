@@ -1,15 +1,18 @@
 """Observations of a robot's arm: its stops, and the pair of frames observed across it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Linear, Noise, Observations, State
-from visioncal.estimation.unknowns import ARM
+from visioncal.estimation.unknowns import ARM, EDGE
 from visioncal.robot import Loads
 from visioncal.robot.arm_model import ArmModel
 
@@ -143,14 +146,34 @@ class ArmData:
     fit: Fit  # Their fit.
     robot: str
     model: ArmModel
-    error_rad: float  # Size of the errors.
-    stops: IntArray  # (m,) the stops at which it was observed.
-    q: FloatArray  # (m, n) joint angles there [rad].
+    q: FloatArray  # (m, n) joint angles at the stops at which it was observed [rad].
     loads: Loads  # Its loads there.
-    at: FloatArray  # (3,) reference point of the target, in its frame [m].
-    frames: IntArray  # (f,) columns of the unknown frames without a prior.
-    # (6,) which components of the poses are measured (rotation, translation).
-    measured: Mask
+    middles: Mapping[str, FloatArray]  # (3,) centre of targets by their frames, in these [m].
+
+    @cached_property
+    def pair(self) -> ArmPair:
+        """The pair of frames between which the arm is observed."""
+        return ArmPair.of(self.fit.problem, self.fit.state, self.robot)
+
+    @property
+    def stops(self) -> IntArray:
+        """(m,) the stops at which it was observed."""
+        return stops_of(self.fit.problem, self.robot)
+
+    @cached_property
+    def frames(self) -> IntArray:
+        """(f,) columns of the unknown frames without a prior."""
+        edges, problem = self.fit.problem.counted.copy(), self.fit.problem
+        # A point has no rotation to be determined.
+        edges[self.fit.unknowns[EDGE, self.pair.observed]] = True
+        return np.flatnonzero(edges[: 6 * len(problem.unknown)])
+
+    @property
+    def measured(self) -> Mask:
+        """(6,) which components of the poses are measured (rotation, translation)."""
+        # A single point shows no rotation; several points make a frame.
+        directions = self.fit.problem.observations.directions[self.pair.rows]
+        return np.repeat([bool((directions > 3).any()), True], 3)
 
     @property
     def columns(self) -> IntArray:
@@ -167,11 +190,6 @@ class ArmData:
         """(f + p,) columns of the frames and of the arm's errors."""
         return np.concatenate([self.frames, self.columns])
 
-    @property
-    def pair(self) -> ArmPair:
-        """The pair of frames between which the arm is observed."""
-        return ArmPair.of(self.fit.problem, self.fit.state, self.robot)
-
     def place_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Jacobian of the carried point's position at (k, n) joint angles [rad].
 
@@ -183,14 +201,15 @@ class ArmData:
         poses, pair_jacobian = self.pair.jacobian(self.model.base_from_flange(q), perturbations)
         of_arm = pair_jacobian[:, :, -perturbations.shape[2] :]
         jacobian = np.concatenate([pair_jacobian[:, :, self.frames], of_arm], axis=2)
-        whole = self.pair.place_jacobian(poses, jacobian, self.at)
+        middle = self.middles.get(self.pair.observed, np.zeros(3))
+        whole = self.pair.place_jacobian(poses, jacobian, middle)
         return whole[:, :, :-6], whole[:, :, -6:]
 
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
         """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""
         by_chain, by_flange = self.place_jacobian(q)
         chain_covariance = self.fit.whole[np.ix_(self.chain, self.chain)]
-        undetermined = self.error_rad**2 * self.model.undetermined_covariance(q)
+        undetermined = self.model.error_rad**2 * self.model.undetermined_covariance(q)
         variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
         variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)
         return np.asarray(np.sqrt(variances))

@@ -52,7 +52,7 @@ class Jacobians:
         information -= fit.problem.prior_information(fit.state).information
         values, vectors = np.linalg.eigh(information[np.ix_(columns, columns)])
         root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-        return cls(root[:, : len(arm.frames)], arm.error_rad * root[:, len(arm.frames) :])
+        return cls(root[:, : len(arm.frames)], arm.model.error_rad * root[:, len(arm.frames) :])
 
     def free(self) -> tuple[int, FloatArray]:
         """Rank of the frames, and (r, p) the arm's Jacobian projected off them."""

@@ -46,7 +46,7 @@ def far_parameters(
         parameters: (k,) parameters of its table.
         moves: (k, p) their changes by the arm's errors; see `parameter_moves`.
     """
-    size, columns = arm.error_rad, arm.columns
+    size, columns = arm.model.error_rad, arm.columns
     posterior = arm.fit.by_noise[np.ix_(columns, columns)] / size**2
     information = np.linalg.inv(posterior) - np.eye(len(columns))
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))

@@ -21,7 +21,7 @@ from visioncal.estimation.fit import Fit
 from visioncal.planning.cell import AnyCell, PlanCell
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
-from visioncal.robot.arm_model import COMPLIANCE, ArmModel, block_size
+from visioncal.robot.arm_model import COMPLIANCE, GROUPS, ArmModel
 from visioncal.robot.errors import ArmErrors, link_basis
 from visioncal.robot.workspace import postures
 from visioncal.vision.board_shape import SCALE, shape_basis, stated_board_sigma
@@ -404,8 +404,8 @@ def with_arm_errors(
 ) -> Fit:
     """Adds errors of the arm at stops (s, n): the purpose's, or those that the stops show."""
     if purpose.blocks:
-        basis, sigma = arm_model(cell.robot, purpose).basis(q), arm_sigma(purpose)
-        arm = ArmErrors(basis, sigma, 0.0, of_links=True)
+        model = arm_model(cell.robot, purpose)
+        arm = ArmErrors(model.basis(q), model.error_rad, 0.0, of_links=True)
     elif arm is not None:
         arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
     return fit if arm is None else fit.with_arm(fit.robots[0], arm)
@@ -413,10 +413,8 @@ def with_arm_errors(
 
 def arm_model(robot: Robot, purpose: Purpose) -> ArmModel:
     """The nominal arm with the unknown errors of a purpose; raises DataError."""
-    sigma = arm_sigma(purpose)
-    weights = {name: block / sigma for name, block in purpose.blocks.items()}
-    model = ArmModel(robot, np.eye(4), weights, np.zeros(arm_size(robot, purpose)))
-    if COMPLIANCE not in weights:
+    model = ArmModel(robot, np.eye(4), {}, np.zeros(0)).with_errors(purpose.blocks)
+    if COMPLIANCE not in purpose.blocks:
         return model
     if robot.masses is None:
         raise DataError(
@@ -436,7 +434,7 @@ def arm_sigma(purpose: Purpose) -> float:
 def arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = None) -> int:
     """Number of errors of the arm that `with_arm_errors` adds."""
     if purpose.blocks or recorded is None or recorded.arm is None:
-        return sum(block_size(name, robot.joint_count) for name in purpose.blocks)
+        return sum(GROUPS[name].per_joint for name in purpose.blocks) * robot.joint_count
     return int(recorded.arm.basis.shape[2])
 
 

@@ -7,18 +7,15 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, fixed, signed, significant
 from visioncal.present.facts import PLUS_MINUS
 from visioncal.present.tables import Fact, Table, TableRow
-from visioncal.results.arm import NOMINAL, ArmErrorsResult, ArmResult, ElasticResult, ThermalResult
+from visioncal.results.arm import (
+    LEVEL_WORDS,
+    NOMINAL,
+    ArmErrorsResult,
+    ArmResult,
+    ElasticResult,
+    ThermalResult,
+)
 
-# Parameters of each model level.
-LEVELS = {
-    NOMINAL: "the arm as stated",
-    "backlash": "play of the joints",
-    "offsets": "offsets of the joints",
-    "geometry": "geometry of the links",
-    "eccentricity": "geometry and eccentric gears",
-    "elastic": "geometry, gears, and joints that bend",
-    "functions": "geometry, gears, gravity, and functions of the joints",
-}
 _SYMBOLS = {
     "theta": "\N{GREEK SMALL LETTER THETA}",
     "alpha": "\N{GREEK SMALL LETTER ALPHA}",
@@ -40,7 +37,7 @@ def joint_words(name: str) -> str:
 
 def level_words(name: str) -> str:
     """The parameters that a level of the arm's model estimates."""
-    return LEVELS.get(name, name.replace("_", " "))
+    return LEVEL_WORDS.get(name, name.replace("_", " "))
 
 
 def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:

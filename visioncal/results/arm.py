@@ -15,6 +15,16 @@ from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel
 
 NOMINAL, FUNCTIONS = "nominal", "functions"
+# Levels of an arm's model by the parameters that are estimated, those with more after the others.
+LEVEL_WORDS = {
+    NOMINAL: "the arm as stated",
+    "backlash": "play of the joints",
+    "offsets": "offsets of the joints",
+    "geometry": "geometry of the links",
+    "eccentricity": "geometry and eccentric gears",
+    "elastic": "geometry, gears, and joints that bend",
+    FUNCTIONS: "geometry, gears, gravity, and functions of the joints",
+}
 # Number of standard deviations beyond which a change is significant.
 _SURE = 3.0
 

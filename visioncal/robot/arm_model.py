@@ -14,14 +14,47 @@ from visioncal.robot import Loads, Robot
 from visioncal.robot.elasticity import WeightFunctions, deflected_joints
 from visioncal.robot.errors import TWIST_UNITS
 
-# Columns of a joint's function (see `Robot.function_jacobian`) by block.
-_FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
-# Blocks that depend on a stop's loads and on the side of approach; the others are the same at all
+# Groups that depend on a stop's loads and on the side of approach; the others are the same at all
 # stops.
 COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
 # Functions of the joints beyond their eccentricity.
 HARMONICS = "harmonics"
-RIGID = ("links", *_FUNCTIONS)
+# Growth and drift with temperature, which have a model and a fit of their own.
+HEAT = "heat"
+# Levels that can be asked for: each has the groups of those before it, and more.
+LEVELS = ("hand-eye", "offsets", "kinematics", "elastic", "thermal", "auto")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Errors of an arm's links or joints that have one size: a level is those that are not zero."""
+
+    opened_by: str  # Level that asks for them.
+    level: str  # Name of the level of an arm that has them, in its result.
+    # Usual size [rad], within a factor of e; of a compliance for 10 N m.
+    usual_rad: float
+    per_joint: int = 1  # Number of values a joint; 0 where it depends on the arm.
+    functions: tuple[int, ...] = ()  # Columns of a joint's function; see `function_jacobian`.
+
+
+GROUPS: Mapping[str, Group] = {
+    "links": Group("kinematics", "geometry", 7e-4, 6),
+    "offsets": Group("offsets", "offsets", 7e-4, functions=(0,)),
+    "ratios": Group("kinematics", "eccentricity", 1e-4, functions=(1,)),
+    "eccentricity": Group("kinematics", "eccentricity", 1.5e-4, 2, functions=(2, 3)),
+    COMPLIANCE: Group("elastic", "elastic", 1e-4),
+    WEIGHT: Group("elastic", "elastic", 1e-4, 0),
+    BACKLASH: Group("offsets", "backlash", 1e-4),
+    HARMONICS: Group("kinematics", "functions", 2e-4, 0),
+    HEAT: Group("thermal", "thermal", 1.0, 0),
+}
+RIGID = ("links", *(name for name, group in GROUPS.items() if group.functions))
+
+
+def groups_of(level: str) -> tuple[str, ...]:
+    """The groups that a level asks for."""
+    rank = LEVELS.index(level)
+    return tuple(name for name, group in GROUPS.items() if LEVELS.index(group.opened_by) <= rank)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +115,7 @@ class ArmModel:
     def with_errors(
         self,
         sizes: Mapping[str, float],
-        yielding: Mask | None,
+        yielding: Mask | None = None,
         functions: JointFunctions | None = None,
     ) -> "ArmModel":
         """Returns the arm with error blocks to be estimated, all zero, by their sizes [rad].
@@ -139,7 +172,7 @@ class ArmModel:
             return 0 if self.functions is None else self.functions.size
         if name == HARMONICS:
             return 0 if self.waves is None else int(self.waves.directions.shape[1])
-        return block_size(name, self.nominal.joint_count)
+        return GROUPS[name].per_joint * self.nominal.joint_count
 
     @cached_property
     def values_by_stop(self) -> FloatArray:
@@ -218,8 +251,8 @@ class ArmModel:
             block = weight * values[self.columns_of(name)]
             if name == "links":
                 placements[1:] += block.reshape(-1, 6) * TWIST_UNITS
-            elif name in _FUNCTIONS:
-                functions[:, _FUNCTIONS[name]] += block.reshape(-1, count).T
+            elif at := GROUPS[name].functions:
+                functions[:, at] += block.reshape(-1, count).T
         return placements, functions
 
     def columns(self, name: str, q: FloatArray, loads: Loads | None = None) -> FloatArray:
@@ -249,7 +282,7 @@ class ArmModel:
             return np.asarray(self._wave_jacobian(bent, self.waves) @ self.waves.directions)
         count = self.nominal.joint_count
         functions = self.robot.function_jacobian(bent).reshape(len(q), 6, count, 4)
-        return np.concatenate([functions[..., function] for function in _FUNCTIONS[name]], axis=2)
+        return np.concatenate([functions[..., at] for at in GROUPS[name].functions], axis=2)
 
     def basis(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Jacobian (m, 6, p) of the reported frame by all values, under the loads of each stop."""
@@ -279,10 +312,3 @@ def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
     weight = () if robot.masses is not None else (WEIGHT,)
     backlash = (BACKLASH,) if loads.from_both_sides else ()
     return (*RIGID, *compliance, *weight, *backlash)
-
-
-def block_size(name: str, joints: int) -> int:
-    """Number of values in a block of an arm with `joints` joints, for load-independent sizes."""
-    if name in (COMPLIANCE, BACKLASH):
-        return joints
-    return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

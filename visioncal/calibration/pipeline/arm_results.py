@@ -22,6 +22,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 from visioncal.estimation.unknowns import ARM
+from visioncal.robot.arm_model import HEAT, groups_of
 from visioncal.robot.errors import ArmErrors
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
@@ -151,7 +152,7 @@ def with_drifts(arms: Mapping[str, Arm], fit: Fit, level: str) -> dict[str, Arm]
         DataError: Drift is requested, and no arm has the data that it needs.
         DegenerateError: Drift is requested, and the temperature hardly varied.
     """
-    if level not in ("auto", LEVEL):
+    if HEAT not in groups_of(level):
         return dict(arms)
     refused = []
 

@@ -49,7 +49,7 @@ class RunState(Observed):
     """
 
     solver: SolverName = "joint"  # The requested solver, for one robot and one camera.
-    level: str = "auto"  # How far arms are calibrated: a key of `stages.kinematics.ASKED`.
+    level: str = "auto"  # How far arms are calibrated: one of `robot.arm_model.LEVELS`.
     # Joint table convention of calibrated arms; None for the stated one.
     convention: Convention | None = None
     # Corners by view that were detected before this run.

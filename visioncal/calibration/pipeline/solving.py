@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.inliers import initial_inliers, updated_inliers, with_repeats
 from visioncal.calibration.pipeline.starting import Start, find_start
-from visioncal.calibration.stages.arms import Arm, arm_effects, with_link_errors
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
@@ -50,7 +50,7 @@ from visioncal.estimation.outliers import (
     refine_inliers,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
@@ -349,13 +349,10 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
         views = _views_by_camera(observed, cell_fit.poses)
         return refine_jointly(cell_fit, cell_fit.stated_parameters(observed.scenes, views))
     cell_fit = replace(cell_fit, linearised_corners=None)
-    if known := (*cell_fit.other_effects, *arm_effects(cell_fit.arms)):
-        cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, known))
-    arms = with_link_errors(cell_fit.arms, cell_fit.fit)
-    cell_fit = replace(cell_fit, arms=arms)
-    if len(effects := (*cell_fit.other_effects, *arm_effects(arms))) > len(known):
-        cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
-    return cell_fit
+    if cell_fit.effects:
+        cell_fit = cell_fit.refitted()
+    erring = cell_fit.with_errors(cell_fit.fit)
+    return erring.refitted() if len(erring.effects) > len(cell_fit.effects) else erring
 
 
 def _choose_levels(cell_fit: CellFit, noise: Noise, *, functions: bool = False) -> dict[str, Arm]:
@@ -391,12 +388,10 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
     )
     for _ in range(_ROUNDS if is_modelled or is_outdated else 0):
         cell_fit = cell_fit.with_arm_poses()
-        if cell_fit.linearised_corners is None:
-            effects = (*cell_fit.other_effects, *arm_effects(cell_fit.arms))
-            cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
+        if (corners := cell_fit.linearised_corners) is None:
+            cell_fit = cell_fit.refitted()
         else:
-            optics = cell_fit.linearised_corners.camera_parameters
-            fitted = fit_jointly(optics, cell_fit, cell_fit.fit.frames)
+            fitted = fit_jointly(corners.camera_parameters, cell_fit, cell_fit.fit.frames)
             cell_fit = cell_fit.with_joint_fit(fitted)
         moved = {name: arm.relinearised(cell_fit.fit) for name, arm in cell_fit.arms.items()}
         cell_fit = replace(cell_fit, arms={name: arm for name, (arm, _) in moved.items()})
@@ -414,9 +409,3 @@ def _views_by_camera(observed: Observed, views: Sequence[ViewPoses]) -> dict[str
         frame: [poses[view] for view in look.corners if view in poses and view not in excluded]
         for frame, look in observed.cameras.items()
     }
-
-
-def _with_effects(inliers: InlierFit, effects: Sequence[Effect]) -> InlierFit:
-    problem = inliers.problem.with_effects(effects)
-    state = State(inliers.fit.state.edges, problem.start_values)
-    return replace(inliers, problem=problem, fit=replace(inliers.fit, state=state)).refitted()

@@ -193,7 +193,7 @@ def add_parameters(
         sigmas = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)).tolist()
     far = [(parameters[at.at], at) for at in far_parameters(arm, parameters, jacobian)]
     mistyped = [*_mistyped(far, before, nominal)]
-    links, rows = arm.error_rad * model.weights.get("links", 1.0), []
+    links, rows = model.error_rad * model.weights.get("links", 1.0), []
     for parameter, sigma, by_row in zip(parameters, sigmas, jacobian, strict=True):
         stated, identified = parameter.value(before), parameter.value(after)
         rows.append(
@@ -283,6 +283,6 @@ def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobia
     """Jacobians by frames and arm errors at (k, n) postures, weighted as for the stops' noise."""
     columns, flange = arm.model.basis_without_harmonics(q), arm.model.base_from_flange(q)
     by_flange = weight @ arm.pair.at(flange)[0].by_errors
-    errors = by_flange @ (columns * arm.error_rad)
+    errors = by_flange @ (columns * arm.model.error_rad)
     frames = by_flange @ arm.pair.frame_jacobian(flange)
     return Jacobians(frames.reshape(-1, 12), errors.reshape(-1, columns.shape[2]))

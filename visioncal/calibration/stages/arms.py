@@ -12,13 +12,13 @@ from visioncal.core.limits import DETERMINED
 from visioncal.core.transforms import distances, exp, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.arm import arm_effect, find_arm_errors, stops_of
-from visioncal.estimation.armpair import ArmData, ArmPair
+from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
-from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
-from visioncal.estimation.unknowns import ARM, EDGE
+from visioncal.estimation.robot_likelihood import RobotLikelihood
+from visioncal.estimation.unknowns import ARM
 from visioncal.model import Moments
 from visioncal.model.arm import even_progress, sides_of_motion
 from visioncal.model.effects.heat import Heat
@@ -247,31 +247,12 @@ class Arm:
         return matches
 
     def data(self, fit: Fit, middles: Mapping[str, FloatArray]) -> ArmData | None:
-        """The observations of its errors; None for a nominal arm. See `report`."""
-        problem = fit.problem
-        stops = stops_of(problem, self.robot)
-        used, columns = self.at(stops), fit.unknowns.columns((ARM, self.robot))
-        if self.model is None or self.errors is None or used.joints_rad is None or not len(columns):
+        """The observations of its errors; None for a nominal arm. See `arm_report.report_of`."""
+        used = self.at(stops_of(fit.problem, self.robot))
+        is_fitted = self.robot in fit.unknowns.of(ARM)
+        if self.model is None or used.joints_rad is None or not is_fitted:
             return None
-        pair = ArmPair.of(problem, fit.state, self.robot)
-        # A single point shows no rotation; several points make a frame.
-        shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
-        # A point has no rotation to be determined.
-        edges = problem.counted.copy()
-        edges[fit.unknowns[EDGE, pair.observed]] = True
-        edges[6 * len(problem.unknown) :] = False
-        return ArmData(
-            fit,
-            self.robot,
-            self.model,
-            self.errors.sigma,
-            stops,
-            used.joints_rad,
-            used.loads,
-            middles.get(pair.observed, np.zeros(3)),
-            np.flatnonzero(edges),
-            np.repeat([shows_pose, True], 3),
-        )
+        return ArmData(fit, self.robot, self.model, used.joints_rad, used.loads, middles)
 
     @property
     def basis(self) -> FloatArray:
@@ -313,20 +294,3 @@ class Arm:
         arm, gain = replace(self, model=model), self.kinematics.chosen.likelihood_ratio
         errors = ArmErrors(arm.basis, model.error_rad, gain, of_links=True)
         return replace(arm, errors=errors)
-
-
-def arm_effects(arms: Mapping[str, Arm]) -> Iterator[Effect]:
-    """The effects of all arms; see `Arm.effects`."""
-    for arm in arms.values():
-        yield from arm.effects()
-
-
-def with_link_errors(arms: Mapping[str, Arm], fit: Fit) -> dict[str, Arm]:
-    """Looks for errors of the links of the arms whose errors are not free yet."""
-    likelihood = robot_likelihood(fit.problem, fit.state, fit.noise)
-    return {
-        name: arm
-        if arm.has_free_errors
-        else arm.with_errors(likelihood, fit.problem.robots.index(name))
-        for name, arm in arms.items()
-    }

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import Arm, arm_effects, with_link_errors
+from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.error_sizes import ErrorSizes
 from visioncal.calibration.stages.validate import chain_rms_px
@@ -20,6 +20,7 @@ from visioncal.estimation.fit import Fit
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
 from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.vision.camera import intrinsics
@@ -64,6 +65,12 @@ class CellFit:
     def has_links(self) -> bool:
         """Whether errors of an arm's links are free."""
         return any(arm.has_free_errors for arm in self.arms.values())
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Effects beside lenses and boards: those of clocks, what grows, and errors of arms."""
+        of_arms = (effect for arm in self.arms.values() for effect in arm.effects())
+        return (*self.other_effects, *of_arms)
 
     def may_be_of_arms(self, step: FloatArray) -> bool:
         """Whether an arm without joint angles may be off by as much as a frame stepped, (4, 4).
@@ -145,12 +152,26 @@ class CellFit:
         measured[has_corners] = seen.camera_parameters.poses[rows[has_corners]]
         covariance[has_corners] = seen.covariance[rows[has_corners]]
         observations = replace(stated, measured=measured, covariance=covariance)
-        effects = [seen.effect(rows), *self.other_effects, *arm_effects(self.arms)]
-        return replace(problem, observations=observations).with_effects(effects)
+        problem = replace(problem, observations=observations)
+        return problem.with_effects([seen.effect(rows), *self.effects])
+
+    def refitted(self) -> Self:
+        """The fit of the inliers beside all effects, without corners."""
+        inliers = self.inlier_fit
+        problem = inliers.problem.with_effects(self.effects)
+        state = State(inliers.fit.state.edges, problem.start_values)
+        inliers = replace(inliers, problem=problem, fit=replace(inliers.fit, state=state))
+        return replace(self, inlier_fit=inliers.refitted())
 
     def with_errors(self, fitted: Fit) -> Self:
-        """Tests for errors of the arms that are not free yet."""
-        return replace(self, arms=with_link_errors(self.arms, fitted))
+        """Looks for errors of the links of the arms whose errors are not free yet."""
+        likelihood = robot_likelihood(fitted.problem, fitted.state, fitted.noise)
+        robots = fitted.problem.robots
+        arms = {
+            name: arm if arm.has_free_errors else arm.with_errors(likelihood, robots.index(name))
+            for name, arm in self.arms.items()
+        }
+        return replace(self, arms=arms)
 
     def stated_parameters(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]

@@ -18,40 +18,20 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals
-from visioncal.results.arm import FUNCTIONS, NOMINAL, ArmLevel, ArmResult, UnseenView
+from visioncal.results.arm import LEVEL_WORDS, NOMINAL, ArmLevel, ArmResult, UnseenView
 from visioncal.robot import Loads, Robot
 from visioncal.robot.arm_model import (
-    BACKLASH,
     COMPLIANCE,
+    GROUPS,
     HARMONICS,
-    RIGID,
+    LEVELS,
     WEIGHT,
     ArmModel,
     blocks_of,
+    groups_of,
 )
 from visioncal.robot.errors import ArmErrors
 
-# The blocks of errors by what the user asks for: the quick one after a lost encoder, or all that
-# the data determine.
-_ALL = (*RIGID, COMPLIANCE, WEIGHT, BACKLASH, HARMONICS)
-ASKED: Mapping[str, tuple[str, ...]] = {
-    "offsets": ("offsets", BACKLASH),
-    "kinematics": (*RIGID, BACKLASH, HARMONICS),
-    "elastic": _ALL,
-    "thermal": _ALL,
-    "auto": _ALL,
-}
-# The name of a level by the block of errors that it has and the ones before it lack.
-_LEVEL_OF = {
-    BACKLASH: "backlash",
-    "offsets": "offsets",
-    "links": "geometry",
-    "eccentricity": "eccentricity",
-    "ratios": "eccentricity",
-    COMPLIANCE: "elastic",
-    WEIGHT: "elastic",
-    HARMONICS: FUNCTIONS,
-}
 # Units of residuals that are reported.
 _DEG_MM: FloatArray = np.array([np.rad2deg(1.0), 1e3])
 
@@ -72,7 +52,7 @@ class _Trial:
         cls, problem: Problem, state: State, noise: Noise, arm: Arm, sized: SizedArm | None
     ) -> "_Trial":
         """Fits all unknowns with errors of some sizes; those of the nominal arm where None."""
-        model, gain, unknowns, names = None, 0.0, 0, [NOMINAL]
+        model, gain, unknowns, level = None, 0.0, 0, NOMINAL
         if sized is not None:
             model, levels, gain = sized
             effects, q = list(problem.effects), arm.moments.joints[arm.robot]
@@ -82,7 +62,8 @@ class _Trial:
                 effects.append(arm_effect(errors, arm.robot, name))
             problem, unknowns = problem.with_effects(effects), len(model.values)
             noise = replace(noise, robots=levels)
-            names = [level for block, level in _LEVEL_OF.items() if block in model.weights]
+            named = (GROUPS[name].level for name in model.weights)
+            level = max(named, key=[*LEVEL_WORDS].index)
         values = np.append(state.values, problem.start_values[len(state.values) :])
         fit = fit_problem(problem, State(state.edges, values), noise)
         rows, seen = rows_of(problem, arm.robot), problem.observations
@@ -104,7 +85,7 @@ class _Trial:
         )
         held_out[~turned, 0] = np.nan
         figures = ArmLevel(
-            level=names[-1],
+            level=level,
             unknowns=unknowns,
             rms_mm=rms_mm,
             rms_deg=rms_deg,
@@ -135,7 +116,7 @@ def with_likely_errors(
         arm: The arm.
         problem: The observations, with this arm as reported.
         state: The solution with the nominal arm.
-        level: A key of `ASKED`.
+        level: One of `LEVELS`.
         noise: The noise's levels to start from.
         views: (n,) the view of each observation.
         functions: Whether functions of the joints are among the errors; where none are significant,
@@ -145,7 +126,11 @@ def with_likely_errors(
     used = arm.at(stops_of(problem, arm.robot))
     q, nominal, best = used.joints_rad, None, None
     # Fewest stops for functions of the joints.
-    if q is None or not len(q) or (functions and (HARMONICS not in ASKED[level] or len(q) < 20)):
+    if (
+        q is None
+        or not len(q)
+        or (functions and (HARMONICS not in groups_of(level) or len(q) < 20))
+    ):
         return arm
     # Numbers may be so large that their squares are none.
     with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
@@ -206,7 +191,7 @@ def _sized(
     bases = {
         name: model.columns(name, arm.joints_rad, arm.loads)
         for name in blocks_of(model.nominal, arm.loads)
-        if name in ASKED[level]
+        if name in groups_of(level)
     }
     waves = None
     if functions:
@@ -231,9 +216,8 @@ def check_level(level: str) -> None:
     Raises:
         DataError: The level is not known.
     """
-    levels = (*ASKED, "hand-eye")
-    if level not in levels:
-        raise DataError(f"level {level!r} is not one of {', '.join(levels)}.", culprits=["level"])
+    if level not in LEVELS:
+        raise DataError(f"level {level!r} is not one of {', '.join(LEVELS)}.", culprits=["level"])
 
 
 def check_level_is_possible(level: str, *, can: bool, misread: str = "") -> None:

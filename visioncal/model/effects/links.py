@@ -2,14 +2,11 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect
 from visioncal.robot import Robot
-from visioncal.robot.errors import TWIST_UNITS
+from visioncal.robot.errors import link_basis
 
 
 @dataclass(frozen=True)
@@ -32,6 +29,4 @@ class Links(Effect):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        frames = self.robot.link_frames(moments.joints[self.frame])
-        twists = adjoint(invert(frames[:, -1:]) @ frames[:, :-1]) * TWIST_UNITS
-        return np.asarray(np.moveaxis(twists, 1, 2).reshape(len(frames), 6, self.count))
+        return link_basis(self.robot, moments.joints[self.frame])
