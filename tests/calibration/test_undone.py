@@ -43,7 +43,7 @@ from visioncal.interchange.formats.mending import remove_tool, shift_views, turn
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.simulation import simulate
+from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.vision.targets import corner_positions, load_target
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -855,6 +855,23 @@ def test_rows_in_reverse_order_are_mended_by_one_command(tmp_path, monkeypatch):
     assert "--exchange 14,23,15,22,16,21,17,20,18,19 " in followed.runs[0].said
     again = typed("convert", "cell", "other", "--exchange", "14,23,23,14")
     assert "Views 23 and 14 must be exchanged once" in again.refused("--exchange").err
+
+
+@pytest.mark.parametrize("seed", [2, 109, 114, 120])
+def test_two_views_that_are_exchanged_are_named_where_readings_differ_in_noise(seed, tmp_path):
+    """A view fits another stop where it would be an inlier, as at its own."""
+    cell = simulate(CellOptions(views=15, seed=seed))
+    session = Session.load(write_session(cell, tmp_path / "cell", images=False))
+    rows = [{key: view.numbers[key] for key in POSE} for view in session.views]
+    rows[5], rows[6] = rows[6], rows[5]
+    views = [
+        {key: value for key, value in (view.numbers | row).items() if not key.endswith("_rad")}
+        for view, row in zip(session.views, rows, strict=True)
+    ]
+    pairs = zip(session.views, views, strict=True)
+    exchanged = replace(session, views=tuple(replace(view, numbers=row) for view, row in pairs))
+    cause = visioncal.calibrate(exchanged).verdict.causes[0]
+    assert (cause.kind, cause.views) == ("exchanged_views", (5, 6))
 
 
 @pytest.mark.slow

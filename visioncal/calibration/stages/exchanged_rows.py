@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.core.limits import CLEAR_RATIO
-from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.moves import Move
@@ -23,6 +22,7 @@ def other_stops(
     problem: Problem,
     fit: Solution,
     out: IntArray,
+    limits: FloatArray,
     moves: Sequence[Move],
     turns: Mapping[str, FloatArray],
 ) -> dict[int, list[int]]:
@@ -32,6 +32,7 @@ def other_stops(
         problem: All n observations.
         fit: The fit of the inliers.
         out: Observations that are left out.
+        limits: (n,) squared distances up to which observations are inliers.
         moves: Frames that moved between stops.
         turns: (k, 4, 4) `target_from_turned` of targets that look the same turned, by frame.
     """
@@ -41,7 +42,7 @@ def other_stops(
         alike = turns.get(seen.observed[at].partition("@")[0], np.eye(4)[None])
         squares = np.min([_at_stops(problem, fit, at, moves, turn) for turn in alike], axis=0)
         # Stops in the same posture do not count: an observation fits its own about as well.
-        limit = min(chi2_limit(FALSE_REJECTION, 6), squares[seen.stops[at]] / CLEAR_RATIO**2)
+        limit = min(limits[at], squares[seen.stops[at]] / CLEAR_RATIO**2)
         near = np.flatnonzero(squares < limit)
         if len(near):
             found[at] = near[np.argsort(squares[near])].tolist()

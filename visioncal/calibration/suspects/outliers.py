@@ -108,7 +108,9 @@ def explained_outliers(
         session.board_frames[name]: rotation_transforms(target)
         for name, target in session.boards.items()
     }
-    fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
+    fitting = other_stops(
+        agreed.problem, agreed.fit, outliers, agreed.distances.limit, agreed.moves, turns
+    )
     circles = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, circles)]
     faults += _turned(cell_fit, outliers) if not faults else ()
