@@ -120,6 +120,7 @@ def test_directions_drift_and_conditions_are_those_of_the_rows(measuring):
         ambient_c=lambda _: "21.5",
         speed_percent=lambda _: "100",
     )
+    assert not rows.warnings
     found = performance(rows, measuring)
     (pose,) = found.poses
     # Means of ten readings of 20 um and 8 um an axis differ by some 10 um.

@@ -122,12 +122,14 @@ class RobotTable(TableModel):
 
     Optional where poses are enough. form: the maker's form of poses, in which results are stated.
     gravity_m_s2: acceleration of gravity in the robot's base, for a base that is not upright.
+    serial: its serial number, for a report on its accuracy by ISO 9283.
     """
 
     model: str | None = None
     tip: str | None = None
     form: Annotated[str, one_of(*POSE_FORMS)] | None = None
     gravity_m_s2: tuple[Number, Number, Number] | None = None
+    serial: str | int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
