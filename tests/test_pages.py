@@ -16,6 +16,10 @@ from support.recipes import BLOCK, FOLDER
 
 import visioncal
 from visioncal import dynamics
+from visioncal.calibration.suspects.registry import SUSPECTS
+from visioncal.core.codec import entries
+from visioncal.results.document import CalibrationForm
+from visioncal.results.sections import CalibrationSections
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = dict(every_command())
@@ -175,6 +179,32 @@ def test_every_command_and_option_is_on_a_page():
 def test_every_field_of_a_result_is_on_its_page():
     words = set(re.findall(r"\w+", text_of(ROOT / "visioncal" / "results" / "README.md")))
     assert {field.name for field in fields(visioncal.Calibration)} <= words
+
+
+def test_fields_of_a_result_have_the_order_of_its_file():
+    table = text_of(ROOT / "visioncal" / "results" / "README.md").split("\n### ")[0]
+    shown = [
+        name
+        for cell in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+        for name in re.findall(r"`(\w+)`", cell)
+    ]
+    order = [
+        key
+        for form in (CalibrationForm, CalibrationSections)
+        for entry in entries(form)
+        for key in entry.keys
+    ]
+    # The plural of one row stands within it.
+    assert shown == [key for key in order if key not in ("boards", "rigs")]
+
+
+def test_every_kind_of_finding_is_on_a_page():
+    assert {*SUSPECTS} <= set(spans_of(ROOT / "visioncal" / "calibration" / "README.md"))
+
+
+def test_every_public_name_is_on_a_page():
+    words = {word for page in PAGES for name in spans_of(page) for word in re.findall(r"\w+", name)}
+    assert {*visioncal.__all__} - {"__version__"} <= words
 
 
 def test_the_architecture_has_every_package():

@@ -126,7 +126,8 @@ class DynamicsIdentifyOptions(StreamOptions):
 class DynamicsValidateOptions(StreamOptions):
     """Predict the torques of other motions, and say how near that comes.
 
-    Exit status 0: there are figures; 2: there are none, for the reason given.
+    Exit status 0: there are figures; 3: a joint's errors exceed half of its torques' standard
+    deviation; 2: there are no figures, for the reason given.
     """
 
     session: Path = motions_argument()
