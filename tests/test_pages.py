@@ -181,6 +181,20 @@ def test_every_field_of_a_result_is_on_its_page():
     assert {field.name for field in fields(visioncal.Calibration)} <= words
 
 
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
+def test_a_table_of_modules_has_all_of_them(package):
+    page = text_of(package / "README.md")
+    if not re.search(r"^\| (module|package)\b", page, re.MULTILINE):
+        return
+    files = {
+        path.stem
+        for path in package.iterdir()
+        if path.name[0] not in "_." and path.suffix in (".py", "")
+    }
+    named = {name.rpartition(".")[2] for name in spans_of(package / "README.md")}
+    assert files <= named
+
+
 def test_fields_of_a_result_have_the_order_of_its_file():
     table = text_of(ROOT / "visioncal" / "results" / "README.md").split("\n### ")[0]
     shown = [
