@@ -1,6 +1,6 @@
 """The robots' arms of a cell: reading, calibration one by one, covariance."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.thermal import LEVEL, with_drift
-from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import covariance_of_size
 from visioncal.estimation.budget import less_noise
@@ -122,27 +122,20 @@ def with_lasting_errors(fit: Fit, arms: Mapping[str, Arm]) -> Fit:
     return fit.at(fit.state.moved(step)) if step.any() else fit
 
 
-def change_each(
-    arms: Mapping[str, Arm], fit: Fit, change: Callable[[Arm, Problem, State], Arm]
-) -> dict[str, Arm]:
-    """Changes one arm after the other, with the errors of the others in the problem.
+def one_nominal(arms: Mapping[str, Arm], fit: Fit) -> Iterator[tuple[Arm, Problem, State]]:
+    """Each arm, with the problem of a fit where that arm is nominal, and the start of that problem.
 
-    Args:
-        arms: The arms.
-        fit: The fit, with the errors of all arms.
-        change: Computes the changed arm from the arm, the problem with that arm nominal, and the
-            initial state of that problem.
+    The others are as they are when it is their turn: changed ones stay so for those that follow.
     """
-    changed, problem = dict(arms), fit.problem
+    problem = fit.problem
     values = {effect: problem.values_of(effect.name, fit.state) for effect in problem.effects}
     for name, arm in arms.items():
         nominal, state = arm.without_errors(problem), fit.state
         if nominal.effects != tuple(values):
             start = [values.get(effect, effect.values) for effect in nominal.effects]
             state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
-        changed[name] = change(arm, nominal, state)
-        problem = changed[name].applied_to(problem)
-    return changed
+        yield arm, nominal, state
+        problem = arms[name].applied_to(problem)
 
 
 def with_drifts(arms: Mapping[str, Arm], fit: Fit, level: str) -> dict[str, Arm]:
@@ -152,18 +145,12 @@ def with_drifts(arms: Mapping[str, Arm], fit: Fit, level: str) -> dict[str, Arm]
         DataError: Drift is requested, and no arm has the data that it needs.
         DegenerateError: Drift is requested, and the temperature hardly varied.
     """
-    if HEAT not in groups_of(level):
-        return dict(arms)
-    refused = []
-
-    def changed_arm(arm: Arm, nominal: Problem, start: State) -> Arm:
+    changed, refused = dict(arms), list[VisioncalError]()
+    for arm, nominal, start in one_nominal(changed, fit) if HEAT in groups_of(level) else ():
         try:
-            return with_drift(arm, nominal, start)
+            changed[arm.robot] = with_drift(arm, nominal, start)
         except (DataError, DegenerateError) as error:
             refused.append(error.within(f"robot {arm.robot}"))
-            return arm
-
-    changed = change_each(arms, fit, changed_arm)
     if level == LEVEL and refused and len(refused) == len(changed):
         raise refused[0]
     return changed

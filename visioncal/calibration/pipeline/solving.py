@@ -8,8 +8,8 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
-    change_each,
     joint_offsets,
+    one_nominal,
     with_drifts,
     with_pose_errors,
 )
@@ -49,7 +49,6 @@ from visioncal.estimation.outliers import (
     all_as_inliers,
     refine_inliers,
 )
-from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
@@ -357,24 +356,20 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
 
 def _choose_levels(cell_fit: CellFit, noise: Noise, *, functions: bool = False) -> dict[str, Arm]:
     """Selects the errors of each arm; functions of its joints only where asked for."""
-    fit = cell_fit.fit
+    fit, level, arms = cell_fit.fit, cell_fit.level, dict(cell_fit.arms)
     views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
-
-    def with_level(arm: Arm, nominal: Problem, start: State) -> Arm:
-        level = cell_fit.level
+    for arm, nominal, start in one_nominal(arms, fit):
         found = with_likely_errors(arm, nominal, start, level, noise, views, functions=functions)
-        if not functions:
-            return found
-        # They also explain much of a slipped joint: where the slip explains more, they are left
-        # out.
-        waves = None if found.model is None else found.model.waves
-        if waves is None or not (gain := waves.gain):
-            return arm
-        joints = joints_of(fit.problem, joint_offsets({arm.robot: arm}))
-        slips = any(step.gain > gain for step in find_steps(fit.problem, fit.solution, joints))
-        return arm if slips else found
-
-    return change_each(cell_fit.arms, fit, with_level)
+        if functions:
+            waves = None if found.model is None else found.model.waves
+            joints = joints_of(fit.problem, joint_offsets({arm.robot: arm}))
+            steps = find_steps(fit.problem, fit.solution, joints) if waves is not None else ()
+            # Functions of the joints also explain much of a slipped joint: where the slip explains
+            # more, they are left out.
+            if waves is None or any(step.gain > waves.gain for step in steps):
+                continue
+        arms[arm.robot] = found
+    return arms
 
 
 def _converge_arms(cell_fit: CellFit) -> CellFit:

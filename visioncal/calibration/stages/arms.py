@@ -26,7 +26,7 @@ from visioncal.model.heating import recorded_inputs
 from visioncal.results.arm import ArmResult
 from visioncal.robot import Loads, Robot
 from visioncal.robot.arm_model import ArmModel
-from visioncal.robot.errors import SIGNIFICANT, ArmErrors, link_basis, pose_basis
+from visioncal.robot.errors import SIGNIFICANT, ArmErrors, link_basis
 from visioncal.robot.thermal import Inputs, ThermalModel
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
@@ -256,12 +256,9 @@ class Arm:
 
     @property
     def basis(self) -> FloatArray:
-        """Jacobian (s, 6, p) of the flange by arm errors.
-
-        The errors are those of the calibrated model, else of any link, else of the pose.
-        """
+        """Jacobian (s, 6, p) of the flange by errors of the calibrated model, else of any link."""
         if self.nominal is None or self.joints_rad is None:
-            return pose_basis(self.moments.poses[self.robot])
+            raise RuntimeError(f"the joints of {self.robot} are not known")
         if self.model is None:
             return link_basis(self.nominal, self.joints_rad)
         return self.model.basis(self.joints_rad, self.loads)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.arm_results import change_each
+from visioncal.calibration.pipeline.arm_results import one_nominal
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import Arm
 from visioncal.calibration.stages.cell import robot_key
@@ -15,8 +15,6 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import State
 from visioncal.robot import Robot
 from visioncal.robot.loads import gravity_words
 
@@ -73,14 +71,13 @@ def _with_gravity(run: RunState, arm: Arm, robot: Robot, directions: FloatArray)
         for at in directions
     ]
 
-    def changed(other: Arm, problem: Problem, start: State) -> Arm:
-        if other.robot != arm.robot:
-            return other
-        other, level = replace(other, model=None, kinematics=None), cell_fit.level
-        noise, views = cell_fit.noise, run.used
-        return with_likely_errors(other, problem, start, level, noise, views, stated=robots)
-
-    return change_each(cell_fit.arms, cell_fit.fit, changed)[arm.robot]
+    (problem, start), *_ = (
+        (problem, start)
+        for other, problem, start in one_nominal(cell_fit.arms, cell_fit.fit)
+        if other is arm
+    )
+    bare, level, noise = replace(arm, model=None, kinematics=None), cell_fit.level, cell_fit.noise
+    return with_likely_errors(bare, problem, start, level, noise, run.used, stated=robots)
 
 
 # Its misfit goes into encoders, links and scatter, and puts some views far off.
