@@ -320,7 +320,10 @@ def test_corners_that_do_not_fit_are_left_out_refused_or_counted(in_hand):
     cell, calibration = in_hand
     rng = np.random.default_rng(7)
     at = stand(cell, rng)
-    corners = seen_corners(cell, before_camera(cell, BOARD, rng), BOARD, rng)
+    shown = before_camera(cell, BOARD, rng)
+    corners = seen_corners(cell, shown, BOARD, rng)
+    exact = replace(cell, options=replace(cell.options, pixel_sigma_px=0.0))
+    sound_px = seen_corners(exact, shown, BOARD, rng).px
 
     def look(px, ids=corners.ids):
         seen = replace(corners, px=px, ids=ids)
@@ -335,6 +338,12 @@ def test_corners_that_do_not_fit_are_left_out_refused_or_counted(in_hand):
     noisy = look(corners.px + rng.normal(0.0, 1.0, corners.px.shape))
     assert "scatter by" in noisy.warnings[0]
     assert noisy.budget_mm["pixels"] > 5 * sound.budget_mm["pixels"]
+    # By the template corners of sharp images err by so much where light or tilt are others.
+    for sigma_px, is_said in ((0.012, False), (0.05, True)):
+        few = (corners.px - sound_px) / 0.1 * sigma_px
+        sharp = replace(corners, px=sound_px + few, stated_px=0.004)
+        found = locate_target(calibration, sharp, BOARD, at.base_from_flange)
+        assert bool(found.warnings) is is_said
     raised(DataError, "do not determine its pose", look, corners.px[:3], corners.ids[:3])
     raised(DataError, "corners 60 to", look, corners.px, corners.ids + 60 - corners.ids[0])
     empty = np.full((800, 1280), 128, np.uint8)

@@ -25,6 +25,9 @@ from visioncal.vision.pnp import ViewPoses, measure_poses
 from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import corner_positions, rotations
 
+# Errors of corners in sharp images, which differ by light and tilt, are up to this [px].
+_SHARP_PX = 0.03
+
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidates:
@@ -126,7 +129,7 @@ def target_pose_candidates(
     # Rounding of exact corners is no scatter.
     if is_larger and scatter_px >= 1e-6:
         # Light and distance explain less.
-        if scatter_px >= 2.0 * noise_px:
+        if scatter_px >= max(2.0 * noise_px, _SHARP_PX):
             warnings = (
                 f"{label}: the corners scatter by {figure(scatter_px)} px around the target's "
                 f"pose, and {figure(noise_px)} px was to be expected: look whether the image is "
