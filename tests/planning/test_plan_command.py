@@ -15,7 +15,18 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.table import parse_csv, read_views
-from visioncal.simulation import CellOptions, cell_session, simulate, write_session
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    CellOptions,
+    InstrumentAt,
+    NetworkOptions,
+    PointAt,
+    RobotAt,
+    cell_session,
+    simulate,
+    write_session,
+)
 
 pytestmark = pytest.mark.usefixtures("strict_rerun")
 
@@ -135,6 +146,23 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
     assert [value["view"] for value in found["stops"]] == [max(numbers) + 1, max(numbers) + 2]
     first = min(found["stops"], key=lambda pair: pair["rank"])
     assert "determines what was open" in first["why"]
+
+
+def test_stops_are_added_to_a_cell_whose_tracker_reads_a_point(tmp_path):
+    """Of a point no rotation is known, nor needed."""
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),),
+        cameras=(CameraAt("top", place_m=(0.0, -1.0, 1.1)),),
+        boards=(BoardAt("plate", on="a"),),
+        instruments=(InstrumentAt("tracker", (2.5, -1.0, 0.4)),),
+        points=(PointAt("ball", "a", (0.03, -0.02, 0.12)),),
+        stops=12,
+    )
+    cell_session(simulate(options), "cell", seen="corners").save(tmp_path / "cell")
+    said = visioncal(
+        *("plan", tmp_path / "cell", "--add", 2, "-o", tmp_path / "plan", "--candidates", 60)
+    )
+    assert "hand-eye: 2 stops to add" in said.good().out
 
 
 @pytest.mark.parametrize(

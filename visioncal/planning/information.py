@@ -386,10 +386,11 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
     fit = with_arm_errors(cell, purpose, recorded.fit.at(at), joints, recorded.arm)
     information, edges = fit.fisher.copy(), 6 * len(fit.frames)
     information[edges:, edges:] -= prior_of_effects(fit)
-    # Schur complement: the poses of further boards are eliminated.
-    further = slice(12, edges)
-    cross = np.delete(information[further], further, axis=1)
-    eliminated = cross.T @ np.linalg.solve(information[further, further], cross)
+    # Schur complement: the poses of further boards are eliminated, of points their places alone.
+    further = np.arange(12, edges)
+    seen = further[np.diag(information)[further] > 0.0]
+    cross = np.delete(information[seen], further, axis=1)
+    eliminated = cross.T @ np.linalg.solve(information[np.ix_(seen, seen)], cross)
     return np.delete(np.delete(information, further, axis=0), further, axis=1) - eliminated
 
 
