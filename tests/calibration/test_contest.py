@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from benchmarks import elsewhere
 from scipy.spatial.transform import Rotation
-from support.cells import calibrated, pairs_session, reporting
+from support.cells import calibrated, pairs_session, reporting, showing
+from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.sound_findings import SOUND, changed, directions
@@ -21,6 +22,7 @@ from visioncal.calibration.suspects.judged import Findings, JudgedArm
 from visioncal.calibration.suspects.limits import few_stops
 from visioncal.calibration.suspects.ranking import rank_causes
 from visioncal.core.errors import DegenerateError
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import LEFT_OPEN, Finding, Verdict
@@ -119,6 +121,40 @@ def test_a_cause_is_sure_where_its_cure_leaves_noise():
     lens = Finding("focus", "The lens changed at once.", mahalanobis_sq=2.0 * cause.mahalanobis_sq)
     (moved, _) = contested(known, [cause, lens])
     assert not moved.is_proven
+
+
+@pytest.mark.parametrize(
+    ("mount", "first", "by_m"),
+    [
+        (MOUNTS[0], 10, 1e-3),
+        (MOUNTS[1], 14, 2e-3),
+        slow(MOUNTS[1], 8, 4e-3),
+        slow(MOUNTS[0], 12, 6e-3),
+    ],
+)
+def test_a_camera_that_moved_once_is_where_it_stood_last(mount, first, by_m):
+    """Picks come after the session, whether views after the step are used or left out."""
+    options = replace(FINE, mount=mount, views=20, seed=4)
+    cell, moved = simulate(options), simulate(replace(options, camera_moved_m=by_m))
+    known = calibrated(showing(cell, [*cell.corners[:first], *moved.corners[first:]]), joints=False)
+    cause = known.verdict.causes[0]
+    assert cause.kind in ("moved_at_once", "something_moved")
+    assert "has it where it " in cause.words
+    edge, limit = known.assessment.edges["cam"], chi2_limit(FALSE_ALARM, 6)
+    before, after = (next(iter(one.transforms.values())) for one in (cell, moved))
+    assert misfit(edge, after) < limit < misfit(edge, before)
+
+
+@pytest.mark.parametrize(("joint", "by_deg"), [(1, 0.3), slow(0, 0.3)])
+def test_a_joint_that_slipped_unseen_is_among_what_may_have_moved(joint, by_deg):
+    """No frame is accused alone of an arm whose joints are not in the table."""
+    cell = simulate(replace(FINE, seed=2))
+    joints = cell.robot.joints.copy()
+    joints[len(joints) // 2 :, joint] -= np.deg2rad(by_deg)
+    reported = cell.robot.flange_at(joints, cell.robot.loads)
+    cause = calibrated(reporting(cell, base_from_flange=reported), joints=False).verdict.causes[0]
+    assert cause.kind in ("moved_at_once", "something_moved")
+    assert "joint" in cause.words
 
 
 def test_a_camera_that_moved_twice_is_named_with_the_frame_of_either_change():

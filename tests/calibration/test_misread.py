@@ -645,6 +645,12 @@ def test_joints_are_judged_by_their_fit():
     assert np.abs(np.rad2deg(near)).max() < 13.0
     assert not guess(near, near, arm).stands_out
     assert guess(np.rad2deg(near), near, arm).best.reading.words == "the angles in degrees"
+    # One share of all angles is of their unit, and of one joint of its gear.
+    found = guess(joints * 1.01)
+    assert found.sentence("the poses").startswith("With all angles 0.99 % smaller, they fit")
+    found = guess(joints * [1, 1, 1, 1.02, 1, 1])
+    assert found.sentence("the poses").startswith("With q4_rad 1.96 % smaller, they fit")
+    assert "by 0.98039 in all rows" in found.fix
     # Arms move with their base.
     base = exp(np.array([0.2, -0.1, 0.4, 0.3, 0.1, -0.2]))
     for arm in (robot, robot.corrected()):

@@ -5,9 +5,9 @@ with two unknown constant transforms: frames of world and tool, or the unknown e
 A reading of the joints is right where this holds for most rows.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import combinations, product
 
 import numpy as np
@@ -37,6 +37,10 @@ _MODEL_DEVIATION = 0.03
 # leave more, unless they change nothing. Scores below the second are alike: controllers print their
 # poses no more finely.
 _FITS, _FLOOR = 2e-3, 1e-4
+# Cost of a reading with a fitted number, which explains more by chance.
+_FITTED = 1.5
+# Stands for all rotary joints together.
+_ALL = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +145,22 @@ def _with_zero(robot: Robot, joint: int, zero_rad: float) -> JointReading:
         fix=f"Home {name} anew, or add {zero_rad:.5f} to q{joint + 1}_rad in all rows; the poses "
         "x_m to qw, where there are any, were computed by the same zero: empty them.",
         columns=(joint,),
-        # A fitted number explains more by chance.
-        cost=1.5,
+        cost=_FITTED,
+    )
+
+
+def _with_share(robot: Robot, joint: int, share: float) -> JointReading:
+    """The reading in which one joint, or all rotary ones, turn further than recorded."""
+    is_turned = (np.arange(robot.joint_count) == joint) | ((joint == _ALL) & ~robot.chain.prismatic)
+    which = "all angles" if joint == _ALL else f"q{joint + 1}_rad"
+    return replace(
+        declared_reading(robot),
+        mixing=np.diag(1.0 + share * is_turned),
+        words=f"{which} {100.0 * abs(share):.2f} % {'larger' if share > 0.0 else 'smaller'}",
+        fix=f"Multiply {which} by {1.0 + share:.5f} in all rows, or state the gear ratios that the "
+        "controller has: its encoders count other turns.",
+        columns=() if joint == _ALL else (joint,),
+        cost=_FITTED,
     )
 
 
@@ -176,12 +194,12 @@ class JointGuess:
 
     @property
     def zero(self) -> JointReading | None:
-        """The reading with one joint's zero shifted; None where something else may be wrong.
+        """The reading with one joint's zero shifted, or a share; None where more may be wrong.
 
         Of joints with parallel axes it is the more likely one: only a fit of all determines which.
         """
-        is_zero = all(one.zeros.any() and len(one.columns) == 1 for one in self._readings)
-        return self.best.reading if is_zero else None
+        is_fitted = all(one.cost == _FITTED for one in self._readings)
+        return self.best.reading if is_fitted else None
 
     @property
     def _readings(self) -> tuple[JointReading, ...]:
@@ -220,7 +238,7 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
         is_poor = poses.ndim > 2 and is_about_one_axis(poses[:, :3, :3])
         if declared.score <= _FITS or is_poor:
             return JointGuess(declared, declared)
-        readings = [*joint_readings(robot), *_with_zeros(robot, q, poses, rows)]
+        readings = [*joint_readings(robot), *_with_numbers(robot, q, poses, rows)]
         tried = _fitted(readings, q, poses, rows, STARTS)
     least = min(item.score for item in tried)
     # Ratio to the best score within which readings are equivalent: those with the fewest mistakes
@@ -239,26 +257,50 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
     return JointGuess(declared, best, tuple(rivals))
 
 
-def _with_zeros(
+def _with_numbers(
     robot: Robot, q: FloatArray, poses: FloatArray, rows: IntArray
 ) -> list[JointReading]:
-    """The best zero of each inner joint; those of the first and last hide in the constants."""
-    # First step of a joint's zero. A shift of 180 degrees is left out: it looks like an opposite
-    # sign of the joint before or behind it.
-    step = 0.25
-    grid = np.arange(step - np.pi, np.pi - 0.5 * step, step)
-    zeros = dict.fromkeys((np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist(), 0.0)
-    best: list[FittedJoints] = []
-    while zeros and step > _FLOOR:
-        tried = [_with_zero(robot, joint, zeros[joint] + more) for joint in zeros for more in grid]
-        fits = _fitted(tried, q, poses, rows)
-        of_joints = (fits[at : at + len(grid)] for at in range(0, len(fits), len(grid)))
-        best = [min(of_joint, key=lambda item: item.fit.score) for of_joint in of_joints]
-        # Half a step from the right zero, poses scatter by less than a step.
-        best = [item for item in best if item.score < _MODEL_DEVIATION + step]
-        zeros = {item.reading.columns[0]: float(item.reading.zeros.sum()) for item in best}
+    """The best zero of each inner joint, and the best share by which each joint turns further.
+
+    Zeros of the first and last hide in the constants. One of 180 degrees is left out: it looks like
+    an opposite sign of the joint before or behind it.
+    """
+    rotary, step, share = ~robot.chain.prismatic, 0.25, 0.02
+    best = partial(_best_numbers, (q, poses, rows))
+    zeros = np.arange(step - np.pi, np.pi - 0.5 * step, step)
+    found = best(partial(_with_zero, robot), np.flatnonzero(rotary[1:-1]) + 1, zeros, step)
+    # Shares of teeth and of units: of a grade nine tenths of a degree.
+    shares, joints = np.arange(-6.0, 7.0) * share, np.append(np.flatnonzero(rotary), _ALL)
+    return [*found, *best(partial(_with_share, robot), joints, shares, share)]
+
+
+def _best_numbers(
+    against: tuple[FloatArray, FloatArray, IntArray],
+    reading: Callable[[int, float], JointReading],
+    joints: IntArray,
+    grid: FloatArray,
+    step: float,
+) -> list[JointReading]:
+    """The readings with the best number of each joint, from a grid of some step on.
+
+    Args:
+        against: Joint angles, poses and rows; see `_fitted`.
+        reading: The reading by a joint and its number.
+        joints: The joints.
+        grid: The numbers that are tried first.
+        step: The distance of these.
+    """
+    numbers, best = dict.fromkeys(joints.tolist(), 0.0), list[JointReading]()
+    while numbers and step > 0.3 * _FLOOR:
+        tried = [(joint, numbers[joint] + more) for joint in numbers for more in grid.tolist()]
+        fits = _fitted([reading(*one) for one in tried], *against)
+        scores = np.reshape([one.fit.score for one in fits], (len(numbers), len(grid)))
+        at = scores.argmin(axis=1) + len(grid) * np.arange(len(numbers))
+        # Half a step from the right number, poses scatter by less than a step.
+        kept = at[scores.min(axis=1) < _MODEL_DEVIATION + step].tolist()
+        numbers, best = dict(tried[one] for one in kept), [fits[one].reading for one in kept]
         step, grid = step / 4.0, np.arange(-4.0, 5.0) * step / 4.0
-    return [item.reading for item in best]
+    return best
 
 
 def _fitted(

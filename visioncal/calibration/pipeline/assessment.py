@@ -15,6 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
     with_lasting_errors,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
+from visioncal.calibration.pipeline.ended import as_it_ends
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.cell import Cell, ObservationRow
@@ -24,7 +25,7 @@ from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.likely_steps import steps_of, with_free_sizes
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
-from visioncal.calibration.suspects.moved_views import PoseFault
+from visioncal.calibration.suspects.moved_views import PoseFault, later_part
 from visioncal.calibration.suspects.outliers import explained_outliers, movements, versions
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
@@ -70,11 +71,20 @@ class FitAssessment:
         return versions(self.cell_fit)
 
     @cached_property
+    def ended(self) -> Fit:
+        """The fit as the session ends, for which picks come: see `as_it_ends`."""
+        if self.cell_fit.solver != "joint":
+            return self.fit
+        later = None if self.steps else later_part(self.cell_fit)
+        problem, steps = (self.fit.problem, self.steps) if later is None else later
+        return as_it_ends(self.fit, problem, self.cell_fit.arms, steps)
+
+    @cached_property
     def edges(self) -> dict[str, Edge]:
         """The estimated transforms, by the result's names of their child frames."""
         return {
-            self.versions[frame]: Edge(matrix, self.fit.covariance((EDGE, frame)))
-            for frame, matrix in self.fit.frames.items()
+            self.versions[frame]: Edge(matrix, self.ended.covariance((EDGE, frame)))
+            for frame, matrix in self.ended.frames.items()
         }
 
     @property
@@ -108,7 +118,7 @@ class FitAssessment:
     @cached_property
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Standard deviations of each frame's position in its parent, by source [mm]."""
-        budget = budget_mm(self.cell_fit, self.fit)
+        budget = budget_mm(self.cell_fit, self.ended)
         return {self.versions[key]: sigmas for key, sigmas in budget.items()}
 
     @cached_property

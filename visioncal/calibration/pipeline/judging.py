@@ -102,7 +102,7 @@ def findings_of(run: RunState) -> Findings:
 
 def _is_by_lens(run: RunState, worst: Sequence[Direction]) -> bool:
     """Whether most of the variance of the weakest direction is that of an estimated lens."""
-    fit = run.assessment.fit
+    fit = run.assessment.ended
     lens = fit.unknowns.of_kinds(LENS)
     is_estimated = any(look.table.stated is None for look in run.cameras.values())
     if not (run.session.has_one_pair and is_estimated and len(lens)):
@@ -135,7 +135,7 @@ def _use(run: RunState) -> Remedy:
 
 def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     """Input of the prediction of picks."""
-    answer, cell_fit, fit = run.assessment, run.cell_fit, run.assessment.fit
+    answer, cell_fit, fit = run.assessment, run.cell_fit, run.assessment.ended
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
         fit,
@@ -171,7 +171,7 @@ def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, Floa
 
 def _worst(run: RunState) -> list[Direction]:
     """The least certain directions of the unknown frames, the worst first."""
-    answer, cell, fit = run.assessment, run.cell_fit.cell, run.assessment.fit
+    answer, cell, fit = run.assessment, run.cell_fit.cell, run.assessment.ended
     if run.session.has_one_pair:
         names = chain_words(fit.problem, run.session.mount).names
         found = directions(fit.problem, fit.state, fit.whole, names)

@@ -84,7 +84,7 @@ def result_of(run: RunState) -> Calibration:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         mount=session.mount if cell is None else cell.mount,
         edges={name: answer.edges[frame] for frame, name in names.items()},
-        joint_covariance=answer.fit.covariance(*answer.fit.unknowns.all_of(EDGE)[: len(names)]),
+        joint_covariance=answer.ended.covariance(*answer.ended.unknowns.all_of(EDGE)[: len(names)]),
         solvers={},
         noise={},
         views=answer.views,

@@ -86,7 +86,7 @@ class RunState(Observed):
     def uncertainty(self) -> UncertaintyResult:
         """Uncertainty of one camera and one robot where their views look."""
         answer = self.assessment
-        work = uncertainty_of(self.cell_fit, answer.fit)
+        work = uncertainty_of(self.cell_fit, answer.ended)
         return replace(work, noise_95=answer.of_robot(answer.noise_95))
 
     @property

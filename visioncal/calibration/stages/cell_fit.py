@@ -28,9 +28,9 @@ from visioncal.vision.pnp import ViewPoses
 from visioncal.vision.targets import corner_positions
 
 # An arm without joint angles may look like a step of a frame.
-OTHER_POSTURE = (
+_OTHER_POSTURE = (
     ", or the arm went over to another posture (shoulder, elbow or wrist) with its errors, or "
-    "another load bends it"
+    "another load bends it, or one of its joints slipped"
 )
 
 
@@ -82,6 +82,13 @@ class CellFit:
         limit_mm, limit_deg = CalibrationLimits.arm_errors
         is_small = mm <= limit_mm and deg <= limit_deg
         return is_small and not all(arm.is_modelled for arm in self.arms.values())
+
+    def instead_of(self, step: FloatArray) -> str:
+        """An arm without joint angles that looks as if a frame stepped by (4, 4), as a clause."""
+        if self.may_be_of_arms(step):
+            return _OTHER_POSTURE
+        is_known = all(arm.is_modelled for arm in self.arms.values())
+        return "" if is_known else ", or a joint of the arm slipped"
 
     def with_arm_poses(self) -> Self:
         """Replaces the robots' poses by those of their arms."""

@@ -153,11 +153,9 @@ def check_joints(observed: T, *, drops: bool) -> T:
             f"The joint angles do not belong to {zero.robot.name} as they are declared. "
             f"{guess.sentence('what the camera sees')}"
         )
-        finding = Finding(
-            "misread_joints",
-            words,
-            Remedy(f"{zero.fix} --level offsets finds it to the precision of the views."),
-        )
+        level = "offsets" if zero.zeros.any() else "kinematics"
+        step = Remedy(f"{zero.fix} --level {level} finds it to the precision of the views.")
+        finding = Finding("misread_joints", words, step)
         observed = observed.noting((), (finding.of(label),))
     return observed
 

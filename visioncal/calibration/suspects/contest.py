@@ -129,8 +129,10 @@ def _proves(run: RunState, trial: Trial) -> bool:
     (before, after), (problem, fit) = trial.levels, trial.cured
     # Scatter that such arms have anyway needs no cure.
     is_noise = bool((after < _USUAL).all() and not (before < _USUAL).all())
-    is_less = (after < (_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0])).all()
-    if not is_noise and not (is_less and (CLEAR_RATIO * after < before).any()):
+    # Noise of poses that a program measured may be left; that of corners is known.
+    is_less = problem.is_combined and (CLEAR_RATIO * after < before).any()
+    is_less &= (after < (_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0])).all()
+    if not is_noise and not is_less:
         return False
     arms = {name: arm for name, arm in run.cell_fit.arms.items() if not arm.is_modelled}
     patterns = (find_pose_errors(problem, fit.state, fit.noise, name) for name in arms)

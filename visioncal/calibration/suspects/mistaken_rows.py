@@ -35,6 +35,8 @@ _CLIPPED = -2.0 * float(np.log(UNEVEN)), 2.0 * float(np.log(UNEVEN))
 # A flange is nearer to the base than this, and farther from its origin [m]; other positions are in
 # another unit.
 _FARTHEST_M, _NEAREST_M = 20.0, 0.01
+# The same for inches among metres, and for inches that were read as millimetres.
+_INCHES_M = 3.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +153,7 @@ def other_signs(
 
 
 def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[Undoing]:
-    """Views whose position is in millimetres where the others' are in metres, or the reverse.
+    """Views whose position is in millimetres or inches where the others' are in metres, or so.
 
     The sizes of the positions, or of one axis, tell the rows of either unit, however many they are.
     """
@@ -161,6 +163,8 @@ def mixed_unit_rows(record: Record, paired: IntArray, base: float) -> Iterator[U
     for factor, wrong, unit, part in (
         (1e-3, sizes_m > _FARTHEST_M, large, "xyz"),
         (1e3, sizes_m < _NEAREST_M, "a thousandth as large", "xyz"),
+        (0.0254, sizes_m > _INCHES_M[0], "39.37 times as large (inches)", "xyz"),
+        (25.4, sizes_m < _INCHES_M[1], "25.4 times smaller (inches among millimetres)", "xyz"),
         *single,
     ):
         is_scaled = wrong[:, None] & np.array([name in part for name in "xyz"])

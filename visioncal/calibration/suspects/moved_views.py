@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, ranges, view_words
 from visioncal.core.transforms import LEVER_M, exp, invert, log, pose_difference, rotation_angle
@@ -14,7 +14,8 @@ from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import Finding, Option, Remedy, mending, or_alone
 from visioncal.estimation.moves import find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
-from visioncal.estimation.steps import step_of
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.steps import FRAME, Candidate, Step, evidence, step_of
 from visioncal.robot.errors import TWIST_UNITS
 from visioncal.vision.targets import half_turn_of
 
@@ -157,6 +158,29 @@ def views_apart(cell_fit: CellFit) -> frozenset[int]:
     return frozenset(cell_fit.cell.rows[row].view for row in run.rows.tolist())
 
 
+def later_part(cell_fit: CellFit) -> tuple[Problem, tuple[Step, ...]] | None:
+    """The used views with all after a frame moved, and the step, of each frame that it may be.
+
+    None where the views after it are used, or before a tool or base frame that was switched.
+    """
+    if not cell_fit.cell.session.has_one_pair or cell_fit.inlier_fit.used.all():
+        return None
+    found, inliers = _end_run(cell_fit), cell_fit.inlier_fit
+    if found.change is None or found.is_first or is_switched(found.change[1]):
+        return None
+    rows, state, every = found.rows, inliers.fit.state, np.arange(len(inliers.used))
+    if found.change[0]:
+        rows, _ = _alike(inliers, rows, *found.change)
+    problem = inliers.problem.subset(inliers.used | np.isin(every, rows))
+    later, steps = inliers.problem.subset(np.isin(every, rows)), list[Step]()
+    at = int(inliers.problem.observations.stops[found.order[found.at]])
+    for frame in filter(lambda name: later.observations.involves(name).all(), later.unknown):
+        candidate, flat = Candidate(FRAME, frame, np.array([at])), np.zeros((6, 6))
+        step = Step(candidate, at, log(step_of(later, frame, state)[0]), flat, 0.0, flat)
+        steps.append(replace(step, gain=evidence(problem, inliers.fit, step)[0]))
+    return problem, tuple(sorted(steps, key=lambda step: -step.gain))
+
+
 def _moved_run(
     cell_fit: CellFit, found: _EndRun, alike: tuple[str, FloatArray] | None
 ) -> Iterator[PoseFault]:
@@ -182,6 +206,8 @@ def _moved_run(
         when += " on" * (not found.is_first)
         which = "from there on" if found.is_first else "before"
         kept = f" The result is that of the views {which}."
+        if not found.is_first and not is_switched(change[1]):
+            kept = " The result has it where it was last, by these views."
         words += f"; or calibrate the {len(later)} views from there on alone"
         is_far = pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]
         note = OF_OTHER_FRAMES * is_far
@@ -203,8 +229,8 @@ def _moved_run(
         kept = ""
     what, how = _changed_words(cell_fit, *change)
     outliers = np.sort(run).tolist()
-    if cell_fit.may_be_of_arms(change[1]):
-        how += OTHER_POSTURE
+    if by_arm := cell_fit.instead_of(change[1]):
+        how += by_arm
     elif change[0] and np.less(pose_difference(np.eye(4), change[1]), _ARM_ERRS).all():
         how += ", or another load bends the arm"
     words = f"{{views}} were left out: {when}, {what} was another one{how}.{kept}"

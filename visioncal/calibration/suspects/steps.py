@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cell_fit import OTHER_POSTURE
 from visioncal.calibration.suspects.lens import changed_lens
 from visioncal.calibration.suspects.moved_views import (
     OF_OTHER_FRAMES,
@@ -44,6 +43,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     ):
         return
     step, between = steps[0], "; the result is between before and after."
+    last = "; the result has it where it stood last."
     rivals = tuple(_words(other, run) for other in steps[1:2])
     if step.kind == LENS:
         # Another one that is known is in the fit, as scatter.
@@ -68,7 +68,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     is_drift = step.kind == DRIFT
     yield Finding(
         kind,
-        f"{_words(step, run)}{between}",
+        f"{_words(step, run)}{last if step.kind == FRAME else between}",
         Remedy(do)
         if is_drift
         else _of_tool(run, step, do) or cell.or_separately(do, step.stop, note),
@@ -145,8 +145,7 @@ def _words(step: Step, run: RunState) -> str:
         words += f"{run.cell_fit.cell.start_words(one.stop)}, it is {by} from where it was, and "
         since = "it was in between"
     words += f"{when}, it is {moved} from where {since}{source}"
-    if run.cell_fit.may_be_of_arms(exp(step.value)):
-        words += OTHER_POSTURE
+    words += run.cell_fit.instead_of(exp(step.value))
     if is_far:
         words += f", or the controller's {'tool' if on_flange else 'base frame'} is another one"
         words += f", by {other_frame(before, after)}"
