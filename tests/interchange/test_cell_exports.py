@@ -240,7 +240,7 @@ def test_any_frame_is_written_in_any_other(tmp_path):
     )
     # Numbers are written so that they read back as they are; the way takes a few roundings.
     assert np.allclose(np.loadtxt(io.StringIO(text)), expected, atol=1e-12)
-    assert "aligned by visioncal from 'made up'" in text
+    assert "calibrated by visioncal from 'made up'" in text
     turned = export(source, "text", Selection(edge="base_b_from_cam_top", inverse=True))
     assert np.allclose(np.loadtxt(io.StringIO(turned)) @ expected, np.eye(4), atol=1e-12)
 

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support.aligned_cells import made_up_cell
 from support.cells import reporting
 from support.commands import visioncal
 from support.marks import slow
@@ -16,7 +17,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Camera
 from visioncal.core.verdict import Verdict
 from visioncal.results import Calibration, CameraResult, Edge, Frame, ViewResult
-from visioncal.results.compare import FALSE_ALARMS, compare, to_document
+from visioncal.results.compare import FALSE_ALARMS, _findings, compare, to_document
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 
@@ -79,6 +80,14 @@ def test_a_tool_that_was_exchanged_is_no_equal_result():
     assert any(words.startswith("flange_from_gripper changed") for words in comparison.findings)
     assert compare(short, short).is_equal
     assert compare(first, short).only_in_b == ("flange_from_gripper",)
+
+
+def test_cells_without_a_common_frame_are_not_called_the_same():
+    cell = made_up_cell(4)
+    other = replace(cell, session_sha256="0" * 64)
+    assert [*_findings(cell, other, [], None)] == [
+        "No frame is in both cells: nothing was compared."
+    ]
 
 
 def test_a_change_of_the_lens_is_found():

@@ -617,6 +617,8 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     rows = (cell / "moved/views.csv").read_text().splitlines(keepends=True)
     (stops / "views.csv").write_text("".join(rows[:10]))
     visioncal(*command).refused("9 of 15 stops")
+    elsewhere = visioncal(*command, "--stops", stops).refused("9 of 15 stops")
+    assert f"visioncal record --page -o {stops} --resume" in elsewhere.err
     (stops / "views.csv").write_text("".join(rows))
     options = ("--targets", stops / "views.csv", "--to", "ur")
     visioncal(*command, *options).refused("--cause camera\n", "--cause mount\n")

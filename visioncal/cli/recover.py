@@ -208,7 +208,9 @@ def _recorded(options: RecoverOptions, act: _Act, path: Path) -> Session:
             except DataError as error:
                 warn(f"no stops are planned: {error.message}")
     taken, places = 0 if session is None else len(session.views), planned / STOPS
-    record = act.record or f"visioncal record --page -o {shlex.quote(str(path))}"
+    # The plan's command records into the act's own folder.
+    planned_record = act.record if options.stops is None else None
+    record = planned_record or f"visioncal record --page -o {shlex.quote(str(path))}"
     reason = f"{taken} of {options.count} stops are in {path}."
     how = (
         "Keep clear: an arm whose joint slipped stands elsewhere than it reads. Drive to those"

@@ -277,6 +277,8 @@ def _findings(
     nothing = _NOTHING_ELSE if placed else _NOTHING
     if bad:
         yield "Whether camera or board moved, a bad result does not show."
+    elif a.cell is not None and not edges:
+        yield "No frame is in both cells: nothing was compared."
     elif a.cell is not None:
         frames = some_of([name.partition("_from_")[2] for name in changed])
         yield (

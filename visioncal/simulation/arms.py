@@ -87,7 +87,7 @@ class DhArm:
     waves: FloatArray
     # (k, n) further joint errors at k angles over a turn [rad]; None for none.
     beyond: FloatArray | None = None
-    slides: tuple[int, ...] = ()  # The joints that slide, from 0, over `STROKE_M`.
+    slides: tuple[int, ...] = ()  # The joints that slide, from 0.
 
     @property
     def is_planar(self) -> bool:

@@ -183,7 +183,7 @@ def worst_of(verdicts: Iterable[Verdict]) -> Verdict:
 
 
 def _in_cell(source: Calibration, edge: Edge) -> Placement:
-    origin = f"aligned by visioncal from {source.session_name!r}, {source.created}"
+    origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
     return Placement(edge, origin, source.verdict, conditions=source.conditions)
 
 
