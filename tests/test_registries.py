@@ -16,7 +16,7 @@ from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
 
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.cli.app import app
-from visioncal.core.choices import POSE_FORMS
+from visioncal.core.choices import POSE_FORMS, UNITS_M
 from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats.registry import FOREIGN_FORMATS
 from visioncal.live.capture.devices import ARMS, CAMERAS
@@ -93,6 +93,15 @@ def maker_faults(forms):
             yield f"{form.name}: not in tests/support/makers.py, from its manual"
         if form.name not in exports:
             yield f"{form.name}: the verdict prints export --to {form.name}, which is refused"
+
+
+def unit_faults(units):
+    """Units of length that help or the page of imports leave out."""
+    for name in units:
+        if not in_help(name, "convert"):
+            yield f"{name}: not in visioncal convert --help"
+        if f"`{name}`" not in page("visioncal/interchange/README.md"):
+            yield f"{name}: not among the units of visioncal/interchange/README.md"
 
 
 def device_faults(arms, cameras):
@@ -236,6 +245,7 @@ def test_every_entry_is_where_a_user_looks():
     faults = [
         *export_faults(EXPORT_FORMATS),
         *maker_faults(POSE_FORMS.values()),
+        *unit_faults(UNITS_M),
         *device_faults(ARMS, CAMERAS),
         *kind_faults(KINDS),
         *command_faults(commands()),
@@ -252,6 +262,7 @@ def test_an_entry_that_is_left_out_is_found():
     assert len([*export_faults([replace(export, name="no-such")])]) == 3
     # Form, pages, manual: a maker's export follows from its form.
     assert len([*maker_faults([replace(maker, name="no-such")])]) == 5
+    assert len([*unit_faults(["no-such"])]) == 2
     assert len([*device_faults(["no-such"], ["no-such-cam"])]) == 4
     assert len([*kind_faults({"no-such": KINDS["charuco"]})]) == 4
     assert len([*command_faults(["no-such"])]) == 1
