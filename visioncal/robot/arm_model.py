@@ -306,9 +306,8 @@ def _is_noise(twists: FloatArray) -> bool:
     return bool((count * (mean**2).mean(axis=1) <= limit * scatter).all())
 
 
-def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
-    """The error blocks that stops with the given loads can determine."""
-    compliance = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
-    weight = () if robot.masses is not None else (WEIGHT,)
-    backlash = (BACKLASH,) if loads.from_both_sides else ()
-    return (*RIGID, *compliance, *weight, *backlash)
+def sized_groups(level: str, robot: Robot, loads: Loads) -> tuple[str, ...]:
+    """The groups of a level whose sizes stops with the given loads can determine together."""
+    hidden = {HARMONICS, HEAT, COMPLIANCE if robot.masses is None and not loads.any else ""}
+    hidden |= {"" if robot.masses is None else WEIGHT, "" if loads.from_both_sides else BACKLASH}
+    return tuple(name for name in groups_of(level) if name not in hidden)

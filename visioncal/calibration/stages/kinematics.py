@@ -27,8 +27,8 @@ from visioncal.robot.arm_model import (
     LEVELS,
     WEIGHT,
     ArmModel,
-    blocks_of,
     groups_of,
+    sized_groups,
 )
 from visioncal.robot.errors import ArmErrors
 
@@ -125,12 +125,9 @@ def with_likely_errors(
     """
     used = arm.at(stops_of(problem, arm.robot))
     q, nominal, best = used.joints_rad, None, None
-    # Fewest stops for functions of the joints.
-    if (
-        q is None
-        or not len(q)
-        or (functions and (HARMONICS not in groups_of(level) or len(q) < 20))
-    ):
+    # Fewest stops, and those for functions of the joints.
+    fewest = 20 if functions else 1
+    if q is None or len(q) < fewest or (functions and HARMONICS not in groups_of(level)):
         return arm
     # Numbers may be so large that their squares are none.
     with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
@@ -186,18 +183,13 @@ def _sized(
     functions: bool,
 ) -> SizedArm | None:
     """Errors of a model with their sizes; None where none are likely, or there are few stops."""
-    if arm.joints_rad is None or len(stops_of(problem, arm.robot)) < FEWEST_STOPS:
+    if len(stops_of(problem, arm.robot)) < FEWEST_STOPS:
         return None
-    bases = {
-        name: model.columns(name, arm.joints_rad, arm.loads)
-        for name in blocks_of(model.nominal, arm.loads)
-        if name in groups_of(level)
-    }
-    waves = None
-    if functions:
-        waves = model.robot.harmonic_jacobian(arm.joints_rad, most_orders())
+    q, groups = arm.moments.joints[arm.robot], sized_groups(level, model.nominal, arm.loads)
+    columns = {name: model.columns(name, q, arm.loads) for name in groups}
+    waves = model.robot.harmonic_jacobian(q, most_orders()) if functions else None
     with suppress(np.linalg.LinAlgError):
-        return estimate_arm_sizes(problem, state, noise, arm.robot, model, bases, waves)
+        return estimate_arm_sizes(problem, state, noise, arm.robot, model, columns, waves)
     return None
 
 
