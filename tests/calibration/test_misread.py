@@ -113,6 +113,21 @@ def test_a_mount_that_is_not_given_is_that_of_the_likelier_cell(name, is_measure
     assert guess.notes[0].startswith(f"The mount was not given and is taken for {mount}")
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize(
+    ("unit", "written", "is_inverse"),
+    [("mm", "quaternion-wxyz", True), slow("inch", "quaternion-wxyz", False)],
+)
+def test_another_unit_goes_with_two_other_mistakes(mount, unit, written, is_inverse):
+    """No robot reaches so far in metres; the third is the mount where poses are not inverse."""
+    poses = cell_poses(mount)
+    recorded = invert(poses.true_robot) if is_inverse else poses.true_robot
+    poses = replace(poses, robot=numbers(recorded, written, unit).read_as(Reading()))
+    other = mount if is_inverse else next(each for each in MOUNTS if each != mount)
+    guess = guessed(replace(poses, mount=other))
+    assert is_named(guess, poses), guess.sentence
+
+
 def test_a_mount_that_nothing_determines_is_asked_for():
     poses = cell_poses()
     edges = SOLVERS["park"](poses.true_robot, poses.camera.poses())

@@ -281,14 +281,9 @@ def _best_numbers(
     grid: FloatArray,
     step: float,
 ) -> list[JointReading]:
-    """The readings with the best number of each joint, from a grid of some step on.
+    """The readings with the best number of each joint, from a grid of numbers of some step on.
 
-    Args:
-        against: Joint angles, poses and rows; see `_fitted`.
-        reading: The reading by a joint and its number.
-        joints: The joints.
-        grid: The numbers that are tried first.
-        step: The distance of these.
+    They are fitted `against` joint angles and poses by some rows.
     """
     numbers, best = dict.fromkeys(joints.tolist(), 0.0), list[JointReading]()
     while numbers and step > 0.3 * _FLOOR:

@@ -1,4 +1,4 @@
-"""Search of the table of readings: at most two mistakes at once, all fitted together.
+"""Search of the table of readings: two mistakes at once, and a unit, all fitted together.
 
 The angle of a relative motion between two views is the same for robot and camera, whatever the
 unknown edges are (Chen 1991, "A screw motion approach to uniqueness analysis of head-eye
@@ -10,7 +10,7 @@ distinguished by the fits.
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from typing import TypeAlias
 
 import numpy as np
@@ -56,6 +56,8 @@ _Rotations: TypeAlias = tuple[str, str, tuple[int, ...], float]
 # Readings that are handed on have scores near the best one's but for a quarter of a degree, which
 # noisy poses of few views add to any bound.
 _SLACK = 5e-3
+# No flange is farther from its base [m], in most rows.
+_FARTHEST_M = 5.0
 # Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
 PAIRS_SHARE = 0.35
 
@@ -121,11 +123,16 @@ def search(recording: Recording) -> list[Candidate]:
     # rewritten rotations are tried where no reading is sure; all may turn by the same angles.
     some = recording.robot.rows(rows)
     of_makers = [*rewritten(some, by_makers=True)]
-    for pairs in (
-        [*product((None,), (*plain, *of_makers)), *combinations(plain, 2)],
-        product((None, *plain), [*rewritten(some)]),
+    # With another unit of positions that no robot reaches, any two others may go together.
+    units = [*_units_of_far(plain, some.positions)]
+    of_poses = [one for one in (*plain, *of_makers) if "unit" not in one.fields]
+    for firsts, pairs in (
+        ([declared], [*product((None,), (*plain, *of_makers)), *combinations(plain, 2)]),
+        ([declared], [*product((None, *plain), [*rewritten(some)])]),
+        ([unit.of(declared) for unit in units], [*combinations(of_poses, 2)]),
     ):
-        likely = [*filter(recording.is_likely, _undone(declared, pairs))]
+        undone = chain.from_iterable(_undone(first, pairs) for first in firsts)
+        likely = [*filter(recording.is_likely, undone)]
         near += _near(likely, [*map(mismatch, likely)]) if likely else []
         classes: dict[Hashable, list[Hypothesis]] = {}
         for reading in sorted([declared, *near], key=lambda item: item.cost):
@@ -155,6 +162,12 @@ def search(recording: Recording) -> list[Candidate]:
     others += _of_another_size(recording, [first, *others], rows)
     others.sort(key=lambda item: -item.log_posterior)
     return [first, *others]
+
+
+def _units_of_far(plain: Iterable[Change], positions: FloatArray) -> Iterator[Change]:
+    """Changes of the robot's unit alone, of (n, 3) positions that no robot reaches in metres."""
+    if np.nanmedian(np.linalg.norm(positions, axis=1)) > _FARTHEST_M:
+        yield from (one for one in plain if one.part == "robot" and one.fields.keys() == {"unit"})
 
 
 def search_ends(recording: Recording) -> Iterator[list[Candidate]]:
