@@ -119,7 +119,7 @@ class Mixed:
         ]
         for term in self.terms:
             at = np.append(term.columns, p)
-            common[at[:, None], at] += weights[term.size] * term.common
+            _add(common, at, weights[term.size] * term.common)
             for part in term.parts:
                 errors, cross = units[part.body]
                 errors += weights[term.size] * part.errors
@@ -137,7 +137,7 @@ class Mixed:
             value -= 2.0 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
             solved = (root @ cross).reshape(-1, cross.shape[2])
             at = np.append(body.columns, p)
-            common[at[:, None], at] -= solved.T @ solved
+            _add(common, at, -(solved.T @ solved))
             inner.append(np.swapaxes(root, 1, 2) @ root)
         covariance, log_det = inverse(common[:p, :p])
         values = covariance @ common[:p, p]
@@ -165,38 +165,42 @@ class Mixed:
 
     def _sloped(self, found: Estimate) -> Estimate:
         """An estimate with its gradient and curvature."""
-        weights, p = weights_at(found.logs), self.count
+        weights, p, values = weights_at(found.logs), self.count, np.append(found.values, -1.0)
         gradient, diagonal = np.zeros(self.sizes), np.zeros(self.sizes)
         # Gradients of each size's squares by the common unknowns, errors eliminated; and by these.
         pulls = np.zeros((self.sizes, p))
         inner = np.zeros((self.sizes, self.sizes))
-        spreads, insides = [], []
+        # Of the residual, the last column of rows, nothing is uncertain.
+        covariance, spreads, insides = _widened(_widened(found.covariance.T).T), [], []
         for body, by in zip(self.bodies, found.bodies, strict=True):
             c = body.columns
-            flat = by.response.reshape(-1, len(c)) @ found.covariance[c[:, None], c]
-            spreads.append(flat.reshape(by.response.shape))
-            insides.append(by.covariance + spreads[-1] @ np.swapaxes(by.response, 1, 2))
+            of_body = found.covariance if len(c) == p else found.covariance[c[:, None], c]
+            flat = by.response.reshape(-1, len(c)) @ of_body
+            spread = flat.reshape(by.response.shape)
+            spreads.append(_widened(spread))
+            insides.append(by.covariance + spread @ np.swapaxes(by.response, 1, 2))
         at_errors = [
             np.zeros((self.sizes, *eliminated.errors.shape)) for eliminated in found.bodies
         ]
         for term in self.terms:
             if term.size < 0:
                 continue
-            x = np.append(found.values[term.columns], -1.0)
+            columns = np.append(term.columns, p)
+            x = values[columns]
             pull = term.common @ x
             square = float(x @ pull)
-            some = found.covariance[term.columns[:, None], term.columns]
-            absorbed = float(np.sum(term.common[:-1, :-1] * some))
+            absorbed = float(np.vdot(term.common, covariance[columns[:, None], columns]))
             for part in term.parts:
-                e, places = found.bodies[part.body].errors, self.places[part.body][part.columns]
+                e, columns = found.bodies[part.body].errors, np.append(part.columns, p)
+                cross = part.cross.reshape(-1, len(columns))
                 by_error = (part.errors @ e[:, :, None])[:, :, 0]
-                by_common = part.cross @ np.append(found.values[part.columns], -1.0)
-                square += float(np.sum(e * (by_error + 2.0 * by_common)))
-                absorbed += float(np.sum(part.errors * insides[part.body]))
-                spread = spreads[part.body][:, :, places]
-                absorbed += 2.0 * float(np.sum(part.cross[:, :, :-1] * spread))
+                by_common = (cross @ values[columns]).reshape(e.shape)
+                square += float(np.vdot(e, by_error + 2.0 * by_common))
+                absorbed += float(np.vdot(part.errors, insides[part.body]))
+                spread = np.take(spreads[part.body], self.places[part.body][columns], axis=2)
+                absorbed += 2.0 * float(np.vdot(part.cross, spread))
                 at_errors[part.body][term.size] += by_error + by_common
-                pulls[term.size, part.columns] += np.einsum("umc,um->c", part.cross[:, :, :-1], e)
+                pulls[term.size, part.columns] += (e.ravel() @ cross)[:-1]
             pulls[term.size, term.columns] += pull[:-1]
             weight = weights[term.size]
             gradient[term.size] += 2.0 * (term.count - weight * (square + absorbed))
@@ -210,6 +214,19 @@ class Mixed:
         scale = weights[:-1]
         curvature = np.diag(diagonal) - 4.0 * inner * np.outer(scale, scale)
         return replace(found, gradient=gradient, curvature=curvature)
+
+
+def _add(whole: FloatArray, at: IntArray, more: FloatArray) -> None:
+    """Adds to some rows and columns (c,), in ascending order, of a matrix."""
+    if len(at) == len(whole):
+        whole += more
+    else:
+        whole[at[:, None], at] += more
+
+
+def _widened(array: FloatArray) -> FloatArray:
+    """An array (..., c + 1) with zeros for the residual."""
+    return np.concatenate([array, np.zeros((*array.shape[:-1], 1))], axis=-1)
 
 
 def weights_at(logs: FloatArray) -> FloatArray:
@@ -234,15 +251,21 @@ def inverse(information: FloatArray) -> tuple[FloatArray, float]:
     if not len(information):
         return information, 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information * np.outer(scale, scale)
+    scaled, diagonal = information * scale * scale[:, None], np.arange(len(scale))
     for ridge in _RIDGES:
-        root, failed = lapack.dpotrf(scaled + ridge * np.eye(len(scaled)), lower=1)
+        ridged = scaled.copy()
+        ridged[diagonal, diagonal] += ridge
+        # By columns, as LAPACK has it.
+        root, failed = lapack.dpotrf(ridged.T, lower=1, overwrite_a=1)
         if not failed:
             break
     if failed:
         raise np.linalg.LinAlgError("information that is not finite")
     half, _ = lapack.dpotri(root, lower=1)
-    covariance = (np.tril(half) + np.tril(half, -1).T) * np.outer(scale, scale)
+    half[diagonal, diagonal] /= 2.0
+    covariance = half.T + half
+    covariance *= scale
+    covariance *= scale[:, None]
     log_det = 2.0 * float(np.log(np.diag(root)).sum() - np.log(scale).sum())
     return np.asarray(covariance), log_det
 
