@@ -16,6 +16,7 @@ from support.sound_findings import SOUND, changed, directions
 
 import visioncal
 from visioncal.calibration.pipeline.judging import findings_of
+from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import Findings, JudgedArm
@@ -27,6 +28,7 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import LEFT_OPEN, Finding, Verdict
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, simulate
+from visioncal.verification.calibration_prior import CalibrationPrior
 
 FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 _GRID = np.stack(np.meshgrid(np.arange(7), np.arange(5)), -1).reshape(-1, 2)
@@ -143,6 +145,9 @@ def test_a_camera_that_moved_once_is_where_it_stood_last(mount, first, by_m):
     edge, limit = known.assessment.edges["cam"], chi2_limit(FALSE_ALARM, 6)
     before, after = (next(iter(one.transforms.values())) for one in (cell, moved))
     assert misfit(edge, after) < limit < misfit(edge, before)
+    # A check of later stops reads transforms, lens and board as one.
+    prior = CalibrationPrior.of(result_of(known))
+    assert prior.state.edges[0] == pytest.approx(edge.matrix)
 
 
 @pytest.mark.parametrize(("joint", "by_deg"), [(1, 0.3), slow(0, 0.3)])

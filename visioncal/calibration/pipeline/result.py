@@ -210,7 +210,7 @@ def _joint_fit(run: RunState) -> JointFit | None:
     """The unknowns of the fit with their covariance; None for several points of an instrument."""
     if run.readings is not None and len(run.readings.names) > 1:
         return None
-    boards, fit = run.session.boards, run.assessment.fit
+    boards, fit = run.session.boards, run.assessment.ended
     names = [
         name for name, at in run.session.board_frames.items() if len(boards) < 2 or at in fit.frames
     ]
@@ -233,7 +233,8 @@ def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
     """The residuals of each board at each stop; None where a frame or a clock moved."""
     assessment, other_effects = run.assessment, run.cell_fit.other_effects
     unknown = {effect.name for effect in of_random_effects(other_effects)} | {SIZE}
-    if assessment.moved or any(effect.name not in unknown for effect in other_effects):
+    is_moved = bool(assessment.moved) or assessment.ended is not assessment.fit
+    if is_moved or any(effect.name not in unknown for effect in other_effects):
         return None
     # Of what grew with time or reach, and of a size by which poses were measured, a check knows
     # nothing: it is in the residuals.
@@ -259,7 +260,7 @@ def _fitted_arm(run: RunState, arm: Arm) -> FittedArm | None:
         return None
     # Errors that are not estimated are zero. Estimates of a model are the change from its
     # linearisation point, which its arm contains.
-    values = run.assessment.fit.values((ARM, arm.robot))
+    values = run.assessment.ended.values((ARM, arm.robot))
     values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
         return FittedArm(of="links", values=values, hidden=None if errors.is_likely else True)
@@ -281,7 +282,7 @@ def _fitted_arm(run: RunState, arm: Arm) -> FittedArm | None:
 
 def _fitted_columns(run: RunState, arms: Iterable[Arm]) -> IntArray:
     """Columns of a fit's edges, of free values of lenses and boards, and of arms' errors."""
-    fit = run.assessment.fit
+    fit = run.assessment.ended
     columns = [fit.unknowns.of_kinds(EDGE, LENS)]
     for name in fit.unknowns.of(BOARD):
         kept = np.isin(fit.unknowns.values_of((BOARD, name)), _written(run, name))
@@ -297,7 +298,7 @@ def _fit_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
 
     The second is the part by noise, and by errors that change with time.
     """
-    fit, arm, errors = run.assessment.fit, run.robot_arm, run.robot_arm.errors
+    fit, arm, errors = run.assessment.ended, run.robot_arm, run.robot_arm.errors
     columns = _fitted_columns(run, [arm])
     parts = [part[np.ix_(columns, columns)] for part in (fit.whole, fit.by_noise)]
     if errors is None or errors.is_estimated:
@@ -362,7 +363,7 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
     intrinsics of which only a part is uncertain (the matrix and not the distortion) have zeros for
     the rest.
     """
-    fit, edges = run.assessment.fit, run.assessment.fit.unknowns.of_kinds(EDGE)
+    fit, edges = run.assessment.ended, run.assessment.ended.unknowns.of_kinds(EDGE)
     # Measured poses need no camera, but later use of the result may.
     cameras = {
         frame: CameraResult(camera, estimated=False)
@@ -389,7 +390,7 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
 
 def _joint_fit_of_cell(run: RunState) -> CellJointFit:
     """The unknowns of a whole cell's fit, with their covariance."""
-    fit, plates = run.assessment.fit, tuple(run.session.plates) or ("target",)
+    fit, plates = run.assessment.ended, tuple(run.session.plates) or ("target",)
     arms = {
         robot or "robot": (arm, fitted)
         for robot, arm in run.cell_fit.arms.items()
@@ -421,7 +422,7 @@ def _written(run: RunState, board: str) -> IntArray:
 
 def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
     """The estimated shapes of boards and rigs, by name; exact rigs are left out."""
-    fit, boards, rigs = run.assessment.fit, dict[str, BoardResult](), dict[str, RigResult]()
+    fit, boards, rigs = run.assessment.ended, dict[str, BoardResult](), dict[str, RigResult]()
     names = tuple(name or "target" for name in run.session.plates) or ("target",)
     for name, plate in zip(names, fit.unknowns.of(BOARD), strict=False):
         board, target = (BOARD, plate), run.session.boards[plate]
