@@ -195,6 +195,14 @@ def test_a_camera_that_was_bumped_is_not_one_whose_lens_crept():
     assert [cause.kind for cause in solved(cell).verdict.causes] == ["moved_frame"]
 
 
+def test_a_camera_that_was_bumped_before_most_of_the_earliest_stops_is_named():
+    boards = (FLOOR, BoardAt("plate_a", "a"))
+    options = replace(PLAIN, robots=ROBOTS[:1], boards=boards, stops=36, seed=5)
+    found = solved(simulate(replace(options, moved=(Moved("cam_left", 6, shift_m=0.02),))))
+    assert [(value.frame, value.first_stop) for value in found.cell.moved] == [("cam_left", 6)]
+    assert all(view.used for view in found.views)
+
+
 @pytest.mark.parametrize("stop", [slow(6), 12])
 def test_a_base_that_was_pushed_is_one_finding(stop):
     cell = simulate(replace(PLAIN, moved=(Moved("base_b", stop),), seed=3))

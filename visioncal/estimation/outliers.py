@@ -142,6 +142,9 @@ def inliers_and_moves(
     else:
         fit = fit_problem(problem.subset(used), state)
     used, fit = widened(_ObservationSearch(problem), used, fit)
+    if (first := _first_agreeing(problem, used, movable)) is not None:
+        used, fit = _core(problem, state, stops < first)
+        used, fit = widened(_ObservationSearch(problem), used, fit)
     while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
         found = find_move(problem, fit, relative_squares < 1.0, movable)
@@ -161,6 +164,20 @@ def inliers_and_moves(
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
     return _converged(problem, used, fit, moves)
+
+
+def _first_agreeing(problem: Problem, used: Mask, movable: Sequence[str]) -> int | None:
+    """The stop from which a frame's observations agree, where none of the stops before does.
+
+    So it is of a frame that moved before most of the earliest stops; None for no such frame.
+    """
+    found, stops = list[int](), problem.observations.stops
+    for frame in movable:
+        rows = problem.observations.involves(frame)
+        first = int(stops[rows & used].min()) if (rows & used).any() else -1
+        if len(np.unique(stops[rows & (stops < first)])) >= FEWEST_STOPS:
+            found.append(first)
+    return min(found, default=None)
 
 
 def presumed_inliers(problem: Problem, state: State, used: Mask) -> InlierFit:
