@@ -15,7 +15,8 @@ from visioncal.core.verdict import Finding, Option, Remedy, mending, or_alone
 from visioncal.estimation.moves import find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.steps import FRAME, Candidate, Step, evidence, step_of
+from visioncal.estimation.robot_likelihood import robot_likelihood
+from visioncal.estimation.steps import FRAME, Candidate, Step, step_of, with_step
 from visioncal.robot.errors import TWIST_UNITS
 from visioncal.vision.targets import half_turn_of
 
@@ -177,7 +178,10 @@ def later_part(cell_fit: CellFit) -> tuple[Problem, tuple[Step, ...]] | None:
     for frame in filter(lambda name: later.observations.involves(name).all(), later.unknown):
         candidate, flat = Candidate(FRAME, frame, np.array([at])), np.zeros((6, 6))
         step = Step(candidate, at, log(step_of(later, frame, state)[0]), flat, 0.0, flat)
-        steps.append(replace(step, gain=evidence(problem, inliers.fit, step)[0]))
+        # Each view after it is a part of the step: a likelihood with tails would drop few of them.
+        stepped, fit = with_step(problem, inliers.fit, step)
+        misfit = robot_likelihood(stepped, fit.state, fit.noise).negative_log_likelihood
+        steps.append(replace(step, gain=-2.0 * misfit))
     return problem, tuple(sorted(steps, key=lambda step: -step.gain))
 
 
