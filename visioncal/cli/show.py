@@ -11,7 +11,7 @@ from visioncal.cli.console import say
 from visioncal.cli.result_options import ShowOptions
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
-from visioncal.core.files import read_text
+from visioncal.core.files import check_own, read_text
 from visioncal.core.number_format import some_of
 from visioncal.core.parsing import refuse_given
 from visioncal.interchange.outputs import PERFORMANCE, PREVIEW, RECORDING
@@ -28,6 +28,7 @@ def show_command(options: ShowOptions) -> None:
         if options.certificate:
             folder = options.result if options.result.is_dir() else options.result.parent
             out = options.out or folder / "certificate.html"
+            check_own(out)
             signed = {"operator": options.operator} if options.operator else {}
             signed |= dict(options.serial or ())
             measured = folder / PERFORMANCE
@@ -35,6 +36,7 @@ def show_command(options: ShowOptions) -> None:
             write_certificate(out, stored.calibration, stored.session, signed, tested)
         else:
             out = options.out or Path("report.html")
+            check_own(out)
             write_report(
                 out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
             )

@@ -107,6 +107,26 @@ def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
     )
 
 
+def check_own(path: Path) -> None:
+    """Checks that what a result is to replace names its author: visioncal; raises DataError.
+
+    An empty file loses nothing. Pages, recordings and documents have the name in their beginning.
+    """
+    with named_errors(path):
+        is_file = path.is_file()
+    if not is_file:
+        return
+    with opened(path) as file:
+        beginning = file.read(1_000_000)
+    if beginning and b"visioncal" not in beginning:
+        raise DataError(
+            f"{path} exists and was not written by visioncal, and nothing of others is "
+            "overwritten.",
+            culprits=[str(path)],
+            next_step="Choose another place with -o, or move that file away.",
+        )
+
+
 # Greatest sizes of files [bytes]; larger ones are of another kind, or broken. Thousands of views
 # take a few megabytes as a table or JSON; TOML descriptions are written by hand.
 MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000

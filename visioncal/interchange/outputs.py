@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
-from visioncal.core.files import json_text, write_atomically
+from visioncal.core.files import check_own, json_text, write_atomically
 from visioncal.core.generations import write_generation
 
 # Imported late, so that writing one kind of result does not import all the others.
@@ -28,6 +28,8 @@ CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.r
 VERIFY, PERFORMANCE = "verify.json", "iso9283.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 BOARD = "board.toml"
+# Files of these endings name visioncal.
+_SIGNED = (".html", ".rrd", CALIBRATION, PLAN)
 
 _Writer: TypeAlias = Callable[[Path], None]
 
@@ -250,6 +252,9 @@ def _write(
     # The result last: the other files belong to it.
     written = [*results, *drawings]
     names = [*(other for other in (*others, *without) if other not in written), *reversed(written)]
+    for name in names:
+        if name.endswith(_SIGNED):
+            check_own(folder / name)
     return Written(write_generation(folder, names, write), tuple(undrawn))
 
 

@@ -29,7 +29,7 @@ from visioncal.core.codec import read, write
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError, VisioncalError, check_names
 from visioncal.core.extras import client_library
-from visioncal.core.files import named_errors, natural, read_text, write_atomically
+from visioncal.core.files import check_own, named_errors, natural, read_text, write_atomically
 from visioncal.core.threads import one_blas_thread, safe_path
 from visioncal.core.types import Progress
 from visioncal.core.verdict import need_options
@@ -285,6 +285,7 @@ def batch(
     given = [sessions] if isinstance(sessions, Path | str) else list(sessions)
     options = Options(level, need_mm, need_deg, tuple(sorted(without)))
     jobs = jobs_of(given, folder, options)
+    check_own(folder / PAGE)
     with named_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
