@@ -273,3 +273,58 @@ def test_a_folder_typed_with_mistakes_is_the_session_typed_without(cell, browser
         assert made == wanted
     recorded = tomllib.loads((cell / "with/recorded.toml").read_text())
     assert recorded["left_out"] == ["shot3b.png"]
+
+
+def test_each_button_of_a_row_does_what_it_says(cell, browser, tmp_path):
+    shutil.copytree(cell / "seen/images", tmp_path / "shots")
+    lines = [kuka(view.base_from_flange()) for view in Session.load(cell / "seen").views[:4]]
+    board = ("--target", "charuco_9x6_30mm", "--arm", "manual")
+    words = ("record", "-o", tmp_path / "cell", *board, "--camera", f"folder:{tmp_path / 'shots'}")
+
+    def rows() -> list[tuple[int, int]]:
+        """Numbers of the picture and of the line of each view."""
+        table = csv.DictReader((tmp_path / "cell/views.csv").read_text().splitlines())
+        return [(int(line["picture"][:3]), lines.index(line["typed"])) for line in table]
+
+    with served(*words) as (url, _), opened(browser, url) as page:
+        due(page, "000.png")
+        pasted(page, *lines)
+        row(page, 4).wait_for()
+        changed(page, 2, "This picture has no pose")
+        row(page, 2).wait_for(state="detached")
+        assert rows() == [(0, 0), (2, 1), (3, 2)]
+        # The pose that lost its picture is there to be taken with another.
+        expect(page.get_by_label(POSE)).to_have_value(lines[3])
+        page.get_by_label(POSE).press("Enter")
+        row(page, 5).wait_for()
+        changed(page, 3, "This pose has no picture")
+        row(page, 5).wait_for(state="detached")
+        assert rows() == [(0, 0), (2, 2), (3, 3)]
+        changed(page, 1, "Remove")
+        row(page, 1).wait_for(state="detached")
+        assert rows() == [(2, 2), (3, 3)]
+
+
+def test_typed_lines_outlive_a_reload(cell, browser, tmp_path):
+    shutil.copytree(cell / "seen/images", tmp_path / "shots")
+    board = ("--target", "charuco_9x6_30mm", "--arm", "manual")
+    words = ("record", "-o", tmp_path / "cell", *board, "--camera", f"folder:{tmp_path / 'shots'}")
+    lines = [kuka(view.base_from_flange()) for view in Session.load(cell / "seen").views[:3]]
+    with served(*words) as (url, _), opened(browser, url) as page:
+        due(page, "000.png")
+        field = page.get_by_label(POSE)
+        half = "\n".join([*lines[:2], "X 12"])
+        field.fill(half)
+        page.get_by_text("Line 3: ").wait_for()
+        page.reload()
+        expect(field).to_have_value(half)
+        field.fill("\n".join(lines))
+        page.get_by_text("3 poses").wait_for()
+        field.press("Enter")
+        row(page, 3).wait_for()
+        # Once taken, it does not come back.
+        expect(field).to_have_value("")
+        page.reload()
+        row(page, 3).wait_for()
+        page.wait_for_timeout(500)
+        expect(field).to_have_value("")

@@ -6,7 +6,7 @@ from nicegui import ui
 
 from visioncal.core.documents.pendants import PendantPose
 from visioncal.live.drivers.manual import pose_words
-from visioncal.live.page.state import Row, Snapshot, Visitor
+from visioncal.live.page.state import Fault, Row, Snapshot, Visitor
 from visioncal.live.page.station import Station
 
 # Where the pictures of views are served.
@@ -43,7 +43,7 @@ class ViewTable:
             self._build()
 
     def _build(self) -> None:
-        self._number, mend = 0, self._station.mend
+        self._number = 0
         with ui.row().classes("w-full items-center justify-between no-wrap"):
             self._title = ui.label("").classes("text-lg break-all")
             ui.button("Cancel", on_click=self._dialog.close).props("flat")
@@ -55,21 +55,23 @@ class ViewTable:
         with ui.row().classes("w-full items-center gap-1"):
             self._replaces = ui.button("Replace the pose", on_click=self._repose)
             self._act("Take again", self._station.again)
-            self._act("Remove", mend, "not wanted")
+            self._mends("Remove", "not wanted")
         with ui.row().classes("w-full items-center gap-1"):
             self._other = ui.select([], label="Another view").classes("w-40")
-            self._act(
-                "Exchange their poses",
-                lambda visitor, number: mend(visitor, "exchanged", number, self._other.value or 0),
-            )
+            self._mends("Exchange their poses", "exchanged")
         ui.label("Are poses and pictures one apart from this view on?").classes("text-sm")
         with ui.row().classes("w-full items-center gap-1"):
-            self._act("This picture has no pose", mend, "no pose")
-            self._act("This pose has no picture", mend, "no picture")
+            self._mends("This picture has no pose", "no pose")
+            self._mends("This pose has no picture", "no picture")
 
-    def _act(self, words: str, request: Callable[..., None], *more: object) -> None:
-        ask = lambda: request(self._visitor, self._number, *more)  # noqa: E731
-        ui.button(words, on_click=ask).props("flat")
+    def _mends(self, words: str, fault: Fault) -> None:
+        def mend(visitor: Visitor, number: int) -> None:
+            self._station.mend(visitor, fault, number, self._other.value or 0)
+
+        self._act(words, mend)
+
+    def _act(self, words: str, request: Callable[[Visitor, int], None]) -> None:
+        ui.button(words, on_click=lambda: request(self._visitor, self._number)).props("flat")
 
     def _open(self, number: int) -> None:
         row = self._rows[number].row
