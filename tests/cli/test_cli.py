@@ -877,3 +877,28 @@ def test_mistakes_about_dynamics_are_answered_with_the_next_step(place, monkeypa
     exercise_session("ur5e", streams).save(place / "session")
     first, *_ = follow("dynamics", "identify", "session", "-o", "out").runs
     assert "visioncal dynamics plan ur5e -o motions" in printed_commands(first.good().said)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("calibrate {} --need-mm 0,5", ("--need-mm is '0,5'", "a number above 0")),
+        ("calibrate {} --need-mm 0", ("--need-mm is '0'", "a number above 0")),
+        ("calibrate {} --need-deg nan", ("--need-deg is 'nan'", "a number above 0")),
+        ("verify {} --against {} --most-kg 2,5", ("--most-kg is '2,5'", "of 0 or more", "2.5")),
+        ("simulate new --views 1e6", ("--views is '1e6'", "a whole number of 1 or more")),
+        ("simulate new --robot-sigma-mm nan", ("'nan'", "a number from 0 to 100")),
+        ("plan {} --add -1", ("--add is '-1'", "a whole number from 1 to")),
+        ("calibrate {} --solver tsay", ("'tsay'", "one of joint, tsai", "Did you mean tsai?")),
+        ("calibrate {} -o {}/views.csv", ("--out is", "views.csv, a file", "a folder")),
+        ("show ''", ("RESULT is empty", "variable of the shell")),
+        ("audit ''", ("DATASET is empty",)),
+        ("diff {} ''", ("SECOND is empty",)),
+        ("batch {} '' -o new", ("SESSIONS is empty",)),
+    ],
+)
+def test_a_refused_value_is_shown_with_a_possible_one(rendered, tmp_path, words, said):
+    typed = [word.replace("{}", str(rendered)) for word in shlex.split(words)]
+    with chdir(tmp_path):
+        visioncal(*typed).refused(*said)
+        assert not [*tmp_path.iterdir()]

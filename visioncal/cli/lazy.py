@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from functools import partial
 from importlib import import_module
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
 
@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
+from visioncal.cli.typed_values import check_paths, refusal, shown_name
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import listed
 
@@ -33,6 +34,7 @@ class PlainCommand(TyperCommand):
     """
 
     first: ClassVar[Sequence[str]] = ()  # Options that most need, in order of use.
+    kinds: ClassVar[Mapping[str, Any]] = {}  # Annotations of the values, by their parameters.
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
         """Parses the options; a usage error becomes a DataError."""
@@ -40,37 +42,33 @@ class PlainCommand(TyperCommand):
         try:
             rest = super().parse_args(ctx, args)
         except _USAGE_ERROR as error:
-            message, param = error.format_message(), getattr(error, "param", None)
-            names = [param.opts[-1]] if param else [getattr(error, "option_name", "")]
-            # The parser names the first of what is missing alone.
-            if param is not None and param.required:
-                given, _, _ = self.make_parser(ctx).parse_args(list(typed))
-                required = [each for each in self.params if each.required]
-                if missing := [each for each in required if given.get(each.name) in (None, ())]:
-                    names = [each.opts[-1] for each in missing]
-                    names = [name if name.startswith("-") else name.upper() for name in names]
-                    message = f"{listed(names)} {'is' if len(names) == 1 else 'are'} missing."
-            shows = any("--example" in each.opts for each in self.params)
-            raise DataError(
-                message,
-                culprits=[*filter(None, names)],
-                next_step=f"{ctx.command_path} --help lists what it takes"
-                + (f"; {ctx.command_path} --example prints one that works." if shows else "."),
-            ) from None
-        paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
-        path_options = {opt for path in paths for opt in path.opts}
-        for option, value in (
-            *pairwise(typed),
-            *(name.split("=", 1) for name in typed if "=" in name),
-        ):
-            if option in path_options and not value:
-                raise DataError(
-                    f"{option} is empty, but must be a path.",
-                    culprits=[option],
-                    next_step="Write . for the folder where you are; or look whether a variable of "
-                    "the shell is set.",
-                )
+            raise self._refusal(ctx, error, typed) from None
+        paths = [param for param in self.params if _holds_paths(param, ctx.params.get(param.name))]
+        check_paths(paths, self._words(ctx, typed), typed)
         return rest
+
+    def _words(self, ctx: Any, typed: list[str]) -> dict[str, Any]:  # noqa: ANN401 - typer's own
+        """What was typed for each parameter."""
+        return dict(self.make_parser(ctx).parse_args(list(typed))[0])
+
+    def _refusal(self, ctx: Any, error: Any, typed: list[str]) -> DataError:  # noqa: ANN401
+        message, param = error.format_message(), getattr(error, "param", None)
+        names, step = [shown_name(param) if param else getattr(error, "option_name", "")], ""
+        words = {} if param is None else self._words(ctx, typed)
+        if param is not None and words.get(param.name) not in (None, ()):
+            kind, value = self.kinds.get(param.name), words[param.name]
+            message, step = refusal(param, kind, value, message)
+        elif param is not None and param.required:
+            # The parser names the first of what is missing alone.
+            required = [each for each in self.params if each.required]
+            if missing := [each for each in required if words.get(each.name) in (None, ())]:
+                names = [*map(shown_name, missing)]
+                message = f"{listed(names)} {'is' if len(names) == 1 else 'are'} missing."
+        shows = any("--example" in each.opts for each in self.params)
+        remedy = f"{step} {ctx.command_path} --help lists what it takes".lstrip()
+        if shows:
+            remedy += f"; {ctx.command_path} --example prints one that works"
+        return DataError(message, culprits=[*filter(None, names)], next_step=f"{remedy}.")
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs the command; Ctrl-C ends it with a message."""
@@ -98,6 +96,11 @@ class PlainCommand(TyperCommand):
         for name in sorted(panels, key=lambda panel: (*heads, panel).index(panel)):
             with formatter.section(name):
                 formatter.write_dl(panels[name])
+
+
+def _holds_paths(param: Any, value: object) -> bool:  # noqa: ANN401 - of typer
+    is_list = param.param_type_name == "argument" and isinstance(value, list | tuple)
+    return is_list or isinstance(value, Path)
 
 
 class LazyGroup(TyperGroup):
@@ -161,7 +164,8 @@ class LazyGroup(TyperGroup):
         command.__signature__ = inspect.Signature([at, *parameters])  # type: ignore[attr-defined]
         command.__annotations__ = {value.name: value.annotation for value in (at, *parameters)}
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        kind = type(name, (PlainCommand,), {"first": getattr(record, "first", "").split()})
+        facts = {"first": getattr(record, "first", "").split(), "kinds": get_type_hints(record)}
+        kind = type(name, (PlainCommand,), facts)
         app.command(name, cls=kind, help=record.__doc__)(command)
         return get_command(app)
 

@@ -9,7 +9,7 @@ import typer
 
 from visioncal.core.choices import SITE_FILE, ImagesKept
 from visioncal.core.options import REQUIRED, argument, flag, option
-from visioncal.core.parsing import address_in
+from visioncal.core.parsing import address_in, need_in
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 
@@ -75,8 +75,12 @@ class ActOptions:
 class NeedOptions:
     """Required accuracy of the task."""
 
-    need_mm: float | None = option("Required accuracy of picks, in mm, in place of the session's.")
-    need_deg: float | None = option("The same in rotation, in degrees.")
+    need_mm: float | None = option(
+        "Required accuracy of picks, in mm, in place of the session's.", parse=need_in, metavar="MM"
+    )
+    need_deg: float | None = option(
+        "The same in rotation, in degrees.", parse=need_in, metavar="DEG"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

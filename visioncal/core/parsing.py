@@ -40,6 +40,13 @@ def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> t
     return tuple(scale * value for value in values)
 
 
+def need_in(words: str, option: str) -> float:
+    """Parses a required accuracy; raises DataError."""
+    numbers = [float(words)] if re.fullmatch(r"\+?(\d+\.?\d*|\.\d+)(e-?\d\d?)?", words) else [0.0]
+    _check(0.0 < numbers[0] <= 1e15, words, option, "a number above 0, with a decimal point")
+    return numbers[0]
+
+
 def pairs_in(words: str, option: str) -> tuple[int, ...]:
     """Parses the numbers of pairs of views, written as 8,17 or 8,17,9,16."""
     numbers = _whole_numbers(words)
