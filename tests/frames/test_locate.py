@@ -607,7 +607,9 @@ def test_the_tip_comes_as_near_as_predicted(proved, located):
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
     assert evaluate_gaps(points, away_mm).passed
     assert not evaluate_gaps(points, [5.0] * 5).passed
-    raised(DataError, "5 of 0 mm or more", evaluate_gaps, points, [0.1])
+    raised(DataError, "5 from 0 to 100 mm", evaluate_gaps, points, [0.1])
+    # Beside a block of 150 mm, whose length was not taken off.
+    raised(DataError, "5 from 0 to 100 mm", evaluate_gaps, points, [150.2] * 5)
     metres = [2e-4, 0.0, 5e-3, 0.0, 0.0]
     in_metres = raised(DataError, "in metres, most likely", evaluate_gaps, points, metres)
     assert "--gaps-mm 0.2,0,5,0,0" in in_metres.next_step

@@ -271,7 +271,7 @@ def test_absent_parts_of_a_calibration_are_named(calibrated, tmp_path, place, va
         ("views", [{"view": 0}], r"views\[0\]\.[a-z]+ is missing"),
         ("noise", {"a": {"translation_mm": "0.1"}}, "noise.a.translation_mm is '0.1'"),
         ("cameras", [], r"cameras is \[\], but must be a table"),
-        ("weakest", None, "weakest is None, but must be a text"),
+        ("weakest", None, "weakest is null, but must be a text"),
     ],
 )
 def test_absent_parts_of_a_cell_s_result_are_named(tmp_path, key, value, words):

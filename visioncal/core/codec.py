@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from datetime import date, time
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -34,10 +35,15 @@ def reading(label: str, what: str, next_step: str) -> Iterator[None]:
         raise error.within(label) from error
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(
-            f"{label}: not {what} that this version can read: {error!r}.",
+            f"{label}: not {what} that this version can read: {fault_words(error)}.",
             culprits=[label],
             next_step=next_step,
         ) from error
+
+
+def fault_words(error: Exception) -> str:
+    """Words of an error of reading; those of Python's own come with their kind."""
+    return f"{error}" if type(error) is ValueError else f"{error!r}"
 
 
 @dataclass(frozen=True)
@@ -440,6 +446,10 @@ def wrong_value(value: object, needed: str, path: str, next_step: str = "") -> D
 def shown(value: object) -> str:
     """A value as text for a message, shortened."""
     text = repr(value)
+    if value is None or isinstance(value, bool):
+        text = {None: "null", True: "true", False: "false"}[value]
+    elif isinstance(value, date | time):
+        text = value.isoformat()
     if len(text) <= _SHOWN:
         return text
     if isinstance(value, Mapping):

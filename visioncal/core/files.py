@@ -112,9 +112,7 @@ def check_own(path: Path) -> None:
 
     An empty file loses nothing. Pages, recordings and documents have the name in their beginning.
     """
-    with named_errors(path):
-        is_file = path.is_file()
-    if not is_file:
+    if absence(path):
         return
     with opened(path) as file:
         beginning = file.read(1_000_000)
@@ -215,6 +213,14 @@ def read_text(path: Path | str, most: int = MOST_BYTES) -> str:
 
 def decode_text(data: bytes, label: str) -> str:
     """Decodes UTF-8 with or without byte-order marks; `label` names its origin in DataErrors."""
+    # No text begins with one; two-byte letters do, where nothing marks them.
+    if b"\0" in data[:4] and data[:2] not in UTF16_MARKS:
+        raise DataError(
+            f"{label} has a zero byte in its first letters: it is UTF-16 without a mark, and must "
+            "be UTF-8.",
+            culprits=[label],
+            next_step=save_as_utf8(f"UTF-16{'BE' if data[:1] == bytes(1) else 'LE'}"),
+        )
     try:
         # Programs that mark a text which is marked already leave two.
         return data.decode("utf-8").lstrip("\ufeff")

@@ -27,6 +27,9 @@ from visioncal.vision.board_shape import shaped_corners
 
 # Least gap that is read [mm].
 _LEAST_READ_MM = 0.01
+# Greatest one [mm]: ten times what the verdict calls bad. Beyond it the unit is another, or the
+# clearance was not taken off.
+_LARGEST_MM = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +149,10 @@ def evaluate_gaps(
     Raises:
         DataError: The number of gaps is not that of the points, or one is no length.
     """
-    if len(gaps_mm) != len(points) or not all(0.0 <= gap < np.inf for gap in gaps_mm):
+    if len(gaps_mm) != len(points) or not all(0.0 <= gap <= _LARGEST_MM for gap in gaps_mm):
         raise DataError(
             f"touch-test: the gaps are {', '.join(f'{gap:g}' for gap in gaps_mm)} mm, but must be "
-            f"{len(points)} of 0 mm or more, one per point.",
+            f"{len(points)} from 0 to {_LARGEST_MM:g} mm, one per point.",
             culprits=["--gaps-mm"],
             next_step="Give them in the order of the points, without sign (149.9 mm beside a block "
             "of 150 mm are 0.1), as --gaps-mm 0.2,0.1,0.3,0.2,0.2.",

@@ -136,9 +136,11 @@ def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
 
 
 def of_other_units(missing: Sequence[str], columns: Iterable[str]) -> str:
-    """Words on columns of the same quantities as missing ones, in other units; empty for none."""
+    """Words on columns of missing quantities, in other letters or units; empty for none."""
     stems = {name.rpartition("_")[0]: name for name in missing}
-    pairs = ((name, stems.get(name.rpartition("_")[0])) for name in columns)
+    pairs = [(name, stems.get(name.rpartition("_")[0])) for name in columns]
+    if capitals := [f"{name} as {name.lower()}" for name in columns if name.lower() in missing]:
+        return f"; write {', '.join(capitals)}, in small letters"
     turned = [f"{name} as {wanted}" for name, wanted in pairs if wanted and name != wanted]
     return f"; write {', '.join(turned)}, in the unit of that name" if turned else ""
 
@@ -151,7 +153,14 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
             first = columns.index(name) + 1
             yield f"column {name} is there twice (columns {first} and {place}): delete one"
     if "view" not in columns:
-        yield "the column view, a whole number that names each row, is missing"
+        is_comment = columns and columns[0].startswith(("#", "//"))
+        yield (
+            "the first line is a comment, and has to be the header: delete it"
+            if is_comment
+            else "the column view, a whole number that names each row, is missing"
+        )
+        if is_comment:
+            return
     joints = joint_columns(tuple(columns))
     wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
     gaps = [name for name in wanted if name not in joints]

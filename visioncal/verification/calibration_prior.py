@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.codec import fault_words
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import exp
@@ -59,7 +60,7 @@ class CalibrationPrior:
             return _read(calibration, fit)
         except (LookupError, TypeError, ValueError) as error:
             raise DataError(
-                f"{label}: joint_fit cannot be read: {error!r}.",
+                f"{label}: joint_fit cannot be read: {fault_words(error)}.",
                 culprits=["joint_fit"],
                 next_step="Calibrate its session again.",
             ) from error

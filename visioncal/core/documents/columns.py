@@ -18,6 +18,7 @@ from visioncal.core.verdict import READ_AGAIN
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 # A number with a decimal comma, which parts it between commas.
 _PARTED = re.compile(r"\s*[+-]?[0-9]+,[0-9]+\s*")
+_DIGITS = re.compile(r"\s*[+-]?[0-9]*(e[+-]?[0-9]+)?\s*", re.IGNORECASE)
 # Lines of a message at most.
 _SHOWN = 10
 
@@ -140,18 +141,34 @@ class TableReader(NumberChecks):
 
     def __init__(self, table: TextTable) -> None:
         width = len(table.columns)
-        self._rows = [at for at, cells in enumerate(table.rows) if len(cells) == width]
+        repeated = {at for at, cells in enumerate(table.rows) if _stripped(cells) == table.columns}
+        self._rows = [
+            at for at, cells in enumerate(table.rows) if len(cells) == width and at not in repeated
+        ]
         super().__init__(len(self._rows), lambda row: table.place(self._rows[row]), {})
         cells = list(zip(*(table.rows[at] for at in self._rows), strict=True)) or [()] * width
         self.cells: Mapping[str, tuple[str, ...]] = dict(zip(table.columns, cells, strict=True))
         following = 0
         for at, row in enumerate(table.rows):
-            following += len(row) == width
-            if len(row) != width:
-                words = f"it has {len(row)} fields, but the header has {width} columns"
+            is_read = len(row) == width and at not in repeated
+            following += is_read
+            if not is_read:
+                words = "it repeats the header" if at in repeated else self._length_words(row)
                 # Before the problems of the next row that is read.
-                problem = TableProblem(table.place(at), f"{words}{self._parted_words(row)}")
-                self._problems.append((following, problem))
+                self._problems.append((following, TableProblem(table.place(at), words)))
+
+    def _length_words(self, row: Sequence[str]) -> str:
+        """Words on a row that is longer or shorter than the header, the likeliest cause first."""
+        words = f"it has {len(row)} fields, but the header has {len(self.cells)} columns"
+        if row[0].lstrip().startswith(("#", "//")):
+            return f"it is a comment, and a table has none; {words}"
+        # A number with decimals is then two fields.
+        if len(row) > 1.5 * len(self.cells) and all(map(_DIGITS.fullmatch, row)):
+            return (
+                f"its decimals are behind commas, which separate columns, too; {words}: write "
+                "points, or put semicolons between the columns"
+            )
+        return f"{words}{self._parted_words(row)}"
 
     def _parted_words(self, row: Sequence[str]) -> str:
         """Words on a number whose decimal comma parts a row that is too long; empty without one."""
@@ -207,6 +224,10 @@ class TableReader(NumberChecks):
         return np.array([self.values[column.name] for column in columns]).T.reshape(
             self.count, len(columns)
         )
+
+
+def _stripped(cells: Sequence[str]) -> tuple[str, ...]:
+    return tuple(cell.strip() for cell in cells)
 
 
 def _unit_step(names: Sequence[str], numbers: FloatArray, norms: FloatArray) -> str:

@@ -206,7 +206,8 @@ def check_schema(document: Mapping[str, Any], known: int, next_step: str) -> Non
     if schema != known:
         is_newer = isinstance(schema, int) and schema > known
         raise DataError(
-            f"schema is {schema!r}, this version reads {known}.",
+            f"schema is {'missing' if schema is None else shown(schema)}, this version reads "
+            f"{known}.",
             culprits=["schema"],
             next_step="A newer visioncal reads it." if is_newer else next_step,
         )

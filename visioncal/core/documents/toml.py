@@ -67,6 +67,10 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
 def _mended_line(text: str, error: str) -> str:
     """A faulty line of a TOML file and its correction, as a sentence; empty where unknown."""
     found = re.search(r"\(at line (\d+)", error)
+    if found and "Cannot overwrite" in error:
+        return f"The key of line {found[1]} is there already: delete one of the two. "
+    if found and "Illegal character '\\n'" in error:
+        return f'The text of line {found[1]} has no end: put " behind it. '
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
     for pattern, right in _TOML_MISTAKES:
         mended = re.sub(pattern, right, line)
