@@ -776,7 +776,7 @@ WRONG_PLACES = {
         "must be a session, but is a result",
         "recording",
     ),
-    "no folder": (("calibrate", "session", "-o", ""), "-o is empty", "variable"),
+    "no folder": (("calibrate", "session", "-o", ""), "--out is empty", "variable"),
     "no folder, as one word": (("plan", "session", "--out="), "--out is empty", "variable"),
     "touches for a drawing": (
         ("fixture", "session/views.csv", "--cad", "session/views.csv", "--tool", "none"),
@@ -902,3 +902,23 @@ def test_a_refused_value_is_shown_with_a_possible_one(rendered, tmp_path, words,
     with chdir(tmp_path):
         visioncal(*typed).refused(*said)
         assert not [*tmp_path.iterdir()]
+
+
+def test_ctrl_c_before_a_command_has_begun_says_nothing_of_python(monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("visioncal.cli.app.app", interrupted)
+    done = visioncal("doctor", "cell")
+    assert (done.status, done.said) == (130, "")
+    # While its libraries are imported, too.
+    code = (
+        "import builtins; real = builtins.__import__\n"
+        "def fake(name, *more, **others):\n"
+        "    if name == 'visioncal.cli.app': raise KeyboardInterrupt\n"
+        "    return real(name, *more, **others)\n"
+        "builtins.__import__ = fake\n"
+        "from visioncal.cli import main\n"
+    )
+    stopped = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True)
+    assert (stopped.returncode, stopped.stderr) == (130, b"")

@@ -261,6 +261,7 @@ def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(number
         ("X 1 Y 2 Z 3 O 4 A 5 T 6", "comau", "a pose of kawasaki, not of 'comau'"),
         ("1 2 3 4 5 6 7", "kuka", "a pose of ros, not of 'kuka'"),
         (" ".join(map(str, range(16))), None, "must be a pose"),
+        ("p[0,43, -0,29, 0,43, 2,4, 0,97, 0,79]", "", "its decimals are behind commas"),
         ("p[0.4, 0, 0, 0, 0, 0]", "kuka", "a pose of ur, not of 'kuka'"),
         ("p[400, 0, 0, 0, 0, 0]", None, "400 m from the base"),
         ("[[400,0,0],[0.5,0.5,0.5,0.4]]", None, "not a quaternion w, x, y, z"),

@@ -105,6 +105,7 @@ def test_a_folder_that_still_grows_gives_each_picture_to_its_pose(seen, tmp_path
     assert isinstance(small, CameraDevice)
     raised(DriverError, "has 640x400 pixels, not 320x200", small.frame)
     raised(DriverError, "does not exist", open_camera, "folder:none", DeviceSetup())
+    raised(DriverError, "is a file, but", open_camera, f"folder:{__file__}", DeviceSetup())
     raised(DriverError, "cannot be set", open_camera, camera, DeviceSetup(gain=2))
 
 

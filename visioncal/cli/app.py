@@ -128,6 +128,9 @@ def main() -> None:
                 raise
             words, step = _REFUSED[error.errno]
             _refuse(DataError(f"{error.filename or 'A file'} {words}.", next_step=step))
+        except KeyboardInterrupt:
+            # Before a command has begun; see `PlainCommand.invoke`.
+            sys.exit(128 + 2)
 
 
 def _refuse(error: VisioncalError) -> None:

@@ -48,7 +48,7 @@ class PlainCommand(TyperCommand):
         return rest
 
     def _words(self, ctx: Any, typed: list[str]) -> dict[str, Any]:  # noqa: ANN401 - typer's own
-        """What was typed for each parameter."""
+        """The typed value of each parameter."""
         return dict(self.make_parser(ctx).parse_args(list(typed))[0])
 
     def _refusal(self, ctx: Any, error: Any, typed: list[str]) -> DataError:  # noqa: ANN401

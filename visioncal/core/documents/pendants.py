@@ -216,7 +216,12 @@ def _marked(line: str) -> _PendantNumbers | None:
         matches = pattern.findall(line)
         # Two poses in a line are ambiguous.
         if len(matches) == 1:
-            return _numbers(matches[0].strip(), (form,))
+            found = _numbers(matches[0].strip(), (form,))
+            # A position and a quaternion are seven.
+            if found is not None and len(found.numbers) > 7 and "." not in matches[0]:
+                doubt = "its decimals are behind commas, which separate the numbers, too"
+                return replace(found, doubt=doubt)
+            return found
     return None
 
 

@@ -43,7 +43,9 @@ class FolderCamera:
         refuse_settings(self.name, requested, "in the program that takes them")
         if not path or not self._folder.is_dir():
             step = "Give the folder in which the camera's program saves: --camera folder:PATH."
-            raise camera_error(self.name, "does not exist", step)
+            is_file = bool(path) and self._folder.exists()
+            words = "is a file, but must be one of pictures" if is_file else "does not exist"
+            raise camera_error(self.name, words, step)
         self.resolution = requested.resolution or self._next()[1].shape[1::-1]
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:

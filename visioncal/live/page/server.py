@@ -4,7 +4,6 @@ Every browser has a page of its own of the one station, redrawn from its snapsho
 nothing.
 """
 
-import json
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -90,8 +89,6 @@ class _Page:
         self._shown: Snapshot | None = None
         self._visitor = Visitor(station.snapshot)
         self._answers = 0
-        # Where the browser keeps what is typed into this recording.
-        self._place = json.dumps(f"typed {text.title}")
         self._inputs: dict[str, ui.input] = {}
         setup = station.snapshot.setup
         with ui.row().classes("w-full items-center gap-4"):
@@ -152,16 +149,20 @@ class _Page:
                     on_change=self._read,
                 ).classes("w-full")
                 self._typed = (
-                    ui.textarea("Pose of the flange, as the pendant shows it", on_change=self._keep)
+                    ui.textarea("Pose of the flange, as the pendant shows it", on_change=self._read)
                     .props("autofocus autogrow rows=1 autocomplete=off")
                     .classes("w-full font-mono")
                     .on("keydown.enter.prevent", self._take)
+                    .on(
+                        "update:model-value",
+                        js_handler="text => sessionStorage.setItem(document.title, text)",
+                    )
                 )
                 self._understood = ui.label("").props("aria-live=polite")
             self._refusal = ui.label("").classes("text-red-700").props("role=alert")
             with ui.row().classes("gap-1"):
                 self._take_button = ui.button("Take view (Enter)", on_click=self._take)
-                self._keeps = self._button("", station.again, None)
+                self._keep = self._button("", station.again, None)
                 actions: tuple[tuple[str, Callable[..., None]], ...] = (
                     ("Undo last", partial(station.mend, fault="not wanted")),
                     ("Another pose", station.skip),
@@ -213,15 +214,10 @@ class _Page:
         self._understood.text = " ".join(wrong or words)
         return [] if wrong else poses
 
-    def _keep(self) -> None:
-        """Reads what is typed, and keeps it in the browser until it is taken."""
-        self._read()
-        ui.run_javascript(f"sessionStorage.setItem({self._place}, {json.dumps(self._typed.value)})")
-
     async def _restore(self) -> None:
         """Shows what was typed, and not taken, before a reload."""
         with suppress(TimeoutError):
-            kept = await ui.run_javascript(f"sessionStorage.getItem({self._place})")
+            kept = await ui.run_javascript("sessionStorage.getItem(document.title)")
             if isinstance(kept, str) and not self._typed.value:
                 self._typed.value = kept
 
@@ -241,6 +237,7 @@ class _Page:
             return
         if visitor.lines == tuple(self._lines()):
             self._typed.value, visitor.lines = "", ()
+            ui.run_javascript("sessionStorage.removeItem(document.title)")
         if visitor.returned and not self._typed.value:
             self._typed.value = visitor.returned
         visitor.returned = ""
@@ -284,7 +281,7 @@ class _Page:
             left_out = {name: f"{name} (left out)" for name in now.left_out}
             names = {name: name for name in now.waiting} | left_out
             self._due.set_options(names, value=now.due or None)
-        self._keeps.visible, self._keeps.text = now.again is not None, f"Keep view {now.again}"
+        self._keep.visible, self._keep.text = now.again is not None, f"Keep view {now.again}"
         again = "" if now.again is None else f" {now.again} again"
         self._take_button.text = f"Take view{again} (Enter)"
         self._table.show(now)

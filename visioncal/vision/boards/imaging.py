@@ -56,8 +56,9 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     try:
         with Pillow.open(io.BytesIO(data), formats=_FORMATS) as header:
             header.verify()
-    except Pillow.DecompressionBombError as error:
-        return f"too large: {error}"
+    except Pillow.DecompressionBombError:
+        most = 2e-6 * (Pillow.MAX_IMAGE_PIXELS or 0)
+        return f"too large: images have up to {most:.0f} million pixels"
     except SyntaxError:
         return "unreadable: the file is damaged"
     except (OSError, ValueError):
