@@ -223,6 +223,15 @@ def write_dynamics(folder: Path, run: "Run") -> Written:
     return _write(folder, {DYNAMICS_FILE: run.identified.save}, {REPORT: report}, (RECORDING,))
 
 
+def check_replaceable(
+    folder: Path, names: Collection[str] = (REPORT, RECORDING, CALIBRATION)
+) -> None:
+    """Checks that what is written to a folder replaces no file of others; raises DataError."""
+    for name in names:
+        if name.endswith(_SIGNED):
+            check_own(folder / name)
+
+
 def _write(
     folder: Path,
     results: Mapping[str, _Writer],
@@ -252,9 +261,7 @@ def _write(
     # The result last: the other files belong to it.
     written = [*results, *drawings]
     names = [*(other for other in (*others, *without) if other not in written), *reversed(written)]
-    for name in names:
-        if name.endswith(_SIGNED):
-            check_own(folder / name)
+    check_replaceable(folder, names)
     return Written(write_generation(folder, names, write), tuple(undrawn))
 
 
