@@ -198,12 +198,19 @@ def edited(session: Session, column: str, change) -> Session:
     return Session.assemble(session.document, session.columns, rows, MemoryImages({}))
 
 
-def in_degrees(session):
+def multiplied(session, factor):
     for joint in range(1, 7):
-        session = edited(
-            session, f"q{joint}_rad", lambda _, cell: repr(float(np.rad2deg(float(cell))))
-        )
+        session = edited(session, f"q{joint}_rad", lambda _, cell: repr(factor * float(cell)))
     return session
+
+
+def in_degrees(session):
+    return multiplied(session, float(np.rad2deg(1.0)))
+
+
+def in_gon(session):
+    """Angles in gon, taken for degrees."""
+    return multiplied(session, 400.0 / 360.0)
 
 
 def of_no_instrument(session):
@@ -232,6 +239,7 @@ def by_photographs(session):
             "With q5_rad of the opposite sign, they fit what the instrument reads",
         ),
         (POINTS, in_degrees, "With the angles in degrees, they fit what the instrument reads"),
+        (PROBE, in_gon, "With all angles 10.00 % smaller, they fit what the instrument reads"),
         (POINT, of_no_instrument, r"nothing says how good they are.*leica-at960"),
         (PROBE, by_photographs, r"State sigma_rad in .instrument., or leave the columns"),
     ],

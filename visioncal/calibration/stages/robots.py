@@ -153,9 +153,11 @@ def check_joints(observed: T, *, drops: bool) -> T:
             f"The joint angles do not belong to {zero.robot.name} as they are declared. "
             f"{guess.sentence('what the camera sees')}"
         )
-        level = "offsets" if zero.zeros.any() else "kinematics"
-        step = Remedy(f"{zero.fix} --level {level} finds it to the precision of the views.")
-        finding = Finding("misread_joints", words, step)
+        level, step = "offsets" if zero.zeros.any() else "kinematics", zero.fix
+        # A share of all joints is that of no joint's gear.
+        if zero.columns:
+            step += f" --level {level} finds it to the precision of the views."
+        finding = Finding("misread_joints", words, Remedy(step))
         observed = observed.noting((), (finding.of(label),))
     return observed
 
@@ -178,8 +180,9 @@ def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> N
         guess = _guessed(matched, joints, seen, observed.held_back)
         if guess is None or not guess.stands_out:
             continue
-        # Zeros that are off by less are estimated with the arm [rad].
-        if guess.zero is None or np.abs(guess.zero.zeros).max() > 0.1:
+        # Zeros that are off by less are estimated with the arm [rad]; shares of all angles are not.
+        zero = guess.zero
+        if zero is None or not zero.columns or np.abs(zero.zeros).max() > 0.1:
             raise _misread(observed, reported, matched, guess, "what the instrument reads")
 
 
