@@ -16,7 +16,7 @@ from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import ranges
 from visioncal.core.verdict import Remedy, need_options
-from visioncal.interchange.outputs import check_replaceable, write_outputs
+from visioncal.interchange.outputs import RECORDING, REPORT, check_replaceable, write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_calibration
 from visioncal.results.history import entries_of
 from visioncal.session import Session
@@ -32,8 +32,8 @@ def calibrate_command(options: CalibrateOptions) -> None:
         )
         if options.views is not None:
             loaded = loaded.only(options.views)
-        # Before a fit that may take minutes.
-        check_replaceable(options.out)
+        # Before a fit that may take minutes; a calibration.json only once there is another one.
+        check_replaceable(options.out, (REPORT, RECORDING))
     if options.against is not None:
         _calibrate_loaded(options, loaded, options.against)
         return

@@ -223,9 +223,7 @@ def write_dynamics(folder: Path, run: "Run") -> Written:
     return _write(folder, {DYNAMICS_FILE: run.identified.save}, {REPORT: report}, (RECORDING,))
 
 
-def check_replaceable(
-    folder: Path, names: Collection[str] = (REPORT, RECORDING, CALIBRATION)
-) -> None:
+def check_replaceable(folder: Path, names: Collection[str]) -> None:
     """Checks that what is written to a folder replaces no file of others; raises DataError."""
     for name in names:
         if name.endswith(_SIGNED):
