@@ -435,7 +435,7 @@ def test_a_lens_that_was_refocused_at_once_neither_varies_nor_moved(mount, seed,
     ],
 )
 def test_a_given_lens_that_changed_a_little_competes_with_a_frame(mount, seed, share, shift_px):
-    """The robot's motion tells a focal length from a place, and corners alone hardly do."""
+    """The robot's motion separates a focal length from a place, and corners alone hardly do."""
     first = changed_lens(mount, seed, is_stated=True, share=share, shift_px=shift_px)
     assert first.kind == ("focus" if share else "image_shifted")
     assert "rom view 13 on, " + ("its focal length" if share else "the images") in first.words

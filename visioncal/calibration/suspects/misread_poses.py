@@ -199,7 +199,7 @@ def _with_rest_of_log(run: RunState, robot: str, found: Finding) -> Finding:
     rest = sorted(alike - {*found.views} - _agreeing(run, robot))
     if not rest:
         return found
-    words = f"{found.words} So {'do' if len(rest) > 1 else 'does'} {view_words(rest)}."
+    words = f"{found.words} Left out, too, where its poses are repeated: {view_words(rest)}."
     return replace(found, words=words, views=tuple(sorted((*found.views, *rest))))
 
 
