@@ -25,7 +25,7 @@ from visioncal.present.recording import write_recording
 from visioncal.results import Calibration
 from visioncal.results.depth import bending
 from visioncal.session import MemoryImages, Session
-from visioncal.session.depth import npy_of, read_cloud
+from visioncal.session.depth import npy_of, ply_of, read_cloud
 from visioncal.simulation import DepthOptions
 from visioncal.verification import verdict_of, verify
 from visioncal.vision.camera import project
@@ -395,10 +395,20 @@ def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
     assert len(away) > 1000
     assert np.abs(np.median(away)) < 2e-4
     assert np.std(away) < 2e-4
-    visioncal(
-        "locate", "-c", tmp_path, "--cloud", tmp_path / "cloud.npy", "-o", tmp_path / "base.ply"
-    ).good()
-    again_there = read_cloud((tmp_path / "base.ply").read_bytes(), "base.ply")
+    in_base, by_others = tmp_path / "base.ply", ply_of(cloud).replace(b"visioncal", b"a scanner")
+    placing = ("locate", "-c", tmp_path, "--cloud")
+    for _ in range(2):
+        # A cloud of an earlier call is replaced.
+        visioncal(*placing, tmp_path / "cloud.npy", "-o", in_base).good()
+    measured_cloud = tmp_path / "scan.ply"
+    measured_cloud.write_bytes(by_others)
+    for source, why in (
+        (tmp_path / "cloud.npy", "was not written by visioncal"),
+        (measured_cloud, "the cloud of --cloud itself"),
+    ):
+        visioncal(*placing, source, "-o", measured_cloud).refused(why)
+    assert measured_cloud.read_bytes() == by_others
+    again_there = read_cloud(in_base.read_bytes(), "base.ply")
     # Floats of the file.
     assert again_there == pytest.approx(points[np.isfinite(points[:, 2])], abs=1e-6)
     assert pose.shape == (4, 4)

@@ -1,21 +1,60 @@
 """Real measurements, against what plain OpenCV and scipy scripts get from them."""
 
+import csv
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 from support.marks import slow
 from support.tracked import known_of
 
 import visioncal
+from visioncal.core.types import FloatArray
 from visioncal.estimation import solve
 from visioncal.interchange.formats import DoubtfulSession
 from visioncal.results.views import rms_of
+from visioncal.robot.files import read_robot_document
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
+
+
+def readings_session(
+    robot: dict,
+    joints: FloatArray,
+    read: FloatArray,
+    *,
+    points: Sequence[str] = ("",),
+    held: Sequence[int] = (),
+    **noise: float,
+) -> Session:
+    """A session of an instrument's readings.
+
+    Args:
+        robot: The robot's document.
+        joints: (s, n) angles at the stops [rad].
+        read: (s p, 3) places [m] or (s p, 7) poses [m, quaternions], a stop's together.
+        points: The names of p points.
+        held: Stops that no fit uses.
+        noise: Of the instrument; not stated, so as usual for its kind.
+    """
+    columns = ["view", "stop", "role", "point"]
+    columns += [f"meas_{name}" for name in POSE[: read.shape[1]]]
+    columns += [f"q{at}_rad" for at in range(1, joints.shape[1] + 1)]
+    cells = []
+    for view, row in enumerate(read.tolist()):
+        stop, point = divmod(view, len(points))
+        role = "holdout" if stop in held else ""
+        cells.append(
+            [*map(str, (view, stop)), role, points[point], *map(repr, row + joints[stop].tolist())]
+        )
+    document = {"schema": 1, "name": robot["name"], "instrument": noise}
+    document["robot"] = {"model": robot["name"], "tip": robot["tip"]}
+    return Session.assemble(document, columns, cells, MemoryImages({}), robot_document=robot)
 
 
 def rokae(data: Path) -> Session:
@@ -27,18 +66,20 @@ def rokae(data: Path) -> Session:
     rows = [line.split() for line in (folder / "laser_pos.csv").read_text().splitlines() if line]
     measured = np.array([[float(name) for name in row[7:13]] for row in rows])
     turns = Rotation.from_euler("xyz", measured[:, 3:], degrees=True).as_quat()
-    numbers = np.hstack([1e-3 * measured[:, :3], turns, q]).tolist()
     table = np.loadtxt(folder / "dh.csv", delimiter=",", skiprows=1) * [1.0, 1e-3, 1e-3, 1.0]
     names = ("alpha_rad", "a_m", "d_m", "theta_offset_rad")
     table[:, [0, 3]] = np.deg2rad(table[:, [0, 3]])
     robot = {"schema": 1, "name": "rokae", "tip": "flange", "convention": "modified"}
     robot["joint"] = [dict(zip(names, row, strict=True)) for row in table.tolist()]
-    # What is not stated of the instrument is taken as usual for its kind.
-    document = {"schema": 1, "name": "rokae", "instrument": {"sigma_m": 2e-5, "sigma_rad": 1e-4}}
-    document["robot"] = {"model": "rokae", "tip": "flange"}
-    columns = ["view", *(f"meas_{name}" for name in POSE), *(f"q{at}_rad" for at in range(1, 7))]
-    cells = [[str(view), *map(repr, row)] for view, row in enumerate(numbers)]
-    return Session.assemble(document, columns, cells, MemoryImages({}), robot_document=robot)
+    read = np.hstack([1e-3 * measured[:, :3], turns])
+    return readings_session(robot, q, read, sigma_m=2e-5, sigma_rad=1e-4)
+
+
+def irb120(data: Path, joints: str, places: str) -> tuple[FloatArray, FloatArray]:
+    """Angles [rad] and places [m] of one of the sets of an IRB 120 (Wu et al. 2015)."""
+    names = (joints, places)
+    q, read = (loadmat(data / f"irb120_position/{name}.mat")[name].astype(float) for name in names)
+    return np.deg2rad(q), 1e-3 * read
 
 
 @pytest.mark.slow
@@ -78,6 +119,49 @@ def test_a_six_axis_arm_is_calibrated_by_a_laser_tracker(real_data):
     assert rms.mm < 0.1
     assert rms.deg < 0.03
     assert known.findings.held_out.mm < 0.13
+
+
+@pytest.mark.slow
+def test_an_irb_120_by_a_measuring_arm_predicts_two_other_sets(real_data):
+    q, read = irb120(real_data, "CaliJointAngles", "CaliPosition")
+    robot = read_robot_document("irb120")
+    known = known_of(readings_session(robot, q, read, points=("a", "b", "c"), sigma_m=6e-5))
+    # 4.67 mm in the mean, the frames fitted.
+    assert known.robot_arm.kinematics.nominal.rms_mm > 4.0
+    assert known.findings.held_out.mm < 0.3
+    assert known.verdict.status == "good"
+    for joints, places in (
+        # Plain least squares leave 0.253 and 0.294 mm in the mean.
+        ("TestJointAngles", "TestPosition"),
+        ("TestJointAngles2", "TestPosition2"),
+    ):
+        q, read = irb120(real_data, joints, places)
+        flange = known.robot_arm.model.base_from_flange(q)
+        x = known.assessment.fit.state.edges[0]
+        in_base = read @ x[:3, :3].T + x[:3, 3]
+        on_flange = np.einsum("mji,mj->mi", flange[:, :3, :3], in_base - flange[:, :3, 3])
+        # The sets have another tool: its point is that of the first five configurations.
+        away = 1e3 * np.linalg.norm(on_flange - on_flange[:5].mean(axis=0), axis=1)
+        assert away.mean() < 0.26
+        assert away[5:].mean() < 0.26
+
+
+@pytest.mark.slow
+def test_a_humanoid_whose_joints_hardly_moved_is_not_good(real_data):
+    folder, held = real_data / "figaroh_small", range(3, 61, 10)
+    text = (folder / "talos_left_arm_contact.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    names = [name for name in rows[0] if name.endswith("_joint")]
+    q, read = (
+        np.array([[float(row[name]) for name in part] for row in rows])
+        for part in (names, ("x1", "y1", "z1"))
+    )
+    robot = read_robot_document(str(folder / "talos.urdf"), tip="gripper_left_base_link")
+    known = known_of(readings_session(robot, q, read, held=held, sigma_m=3e-4))
+    away = [view.residual_mm for view in known.findings.views if view.view in held]
+    # Joint offsets alone leave 0.87 mm, in the fit.
+    assert np.median(away) < 0.95
+    assert known.verdict.status != "good"
 
 
 @pytest.mark.parametrize(

@@ -283,6 +283,10 @@ def test_a_change_is_reported_with_its_size(place, name):
     found = checked(place, np.random.default_rng(1), change)
     assert names(found) == expected
     assert not found.passed
+    card = repr(found).splitlines()
+    assert card[0].endswith(": does not hold")
+    assert expected[0] in card[2]
+    assert len(card) == 4
     said = verdict_of(found).reasons[0]
     assert words in said
     # Whatever stands still moves as much in a base that was pushed.

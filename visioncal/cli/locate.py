@@ -14,7 +14,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.conventions import PoseForm, controller_form, stated_pose
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, write_atomically
+from visioncal.core.files import MOST_IMAGE_BYTES, check_own, read_bytes, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.core.types import FloatArray, Mount, Target
@@ -185,9 +185,18 @@ def _write_cloud(
             culprits=["--output"],
             next_step="Add -o cloud.ply.",
         )
+    if output.exists() and output.samefile(cloud):
+        raise DataError(
+            f"-o {output} is the cloud of --cloud itself, which is kept as it was measured.",
+            culprits=["--output"],
+            next_step="Add -o with another name.",
+        )
+    is_ply = output.suffix.lower() == ".ply"
+    if is_ply:
+        check_own(output)
     points = read_cloud(read_bytes(cloud, MOST_IMAGE_BYTES), cloud.name)
     placed = cloud_in_base(calibration, points, flange, joints_rad=joints_rad)
-    write_atomically(output, (ply_of if output.suffix.lower() == ".ply" else npy_of)(placed))
+    write_atomically(output, (ply_of if is_ply else npy_of)(placed))
     say(f"wrote {output}: {np.isfinite(placed[..., 2]).sum()} points in the base, in metres")
 
 

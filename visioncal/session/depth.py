@@ -228,7 +228,8 @@ def ply_of(points_m: FloatArray) -> bytes:
     flat = points_m.reshape(-1, 3)
     flat = flat[np.isfinite(flat[:, 2])]
     axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(flat)}\n{axes}end_header\n"
+    head = f"ply\nformat binary_little_endian 1.0\ncomment visioncal\nelement vertex {len(flat)}\n"
+    head += f"{axes}end_header\n"
     return head.encode() + flat.astype("<f4").tobytes()
 
 

@@ -10,7 +10,9 @@ from scipy.special import fdtrc
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
+from visioncal.core.number_format import figure, listed
 from visioncal.core.quantiles import f_limit
+from visioncal.core.summaries import text_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
@@ -81,6 +83,13 @@ class Check:
     explained: bool  # Whether the likeliest change leaves no more residuals than noise.
     misread: Finding | None = None  # Misreading of the poses that explains what no change does.
     depth: tuple[Finding, ...] = ()  # Whether depth still is what it was, where there is some.
+
+    def __repr__(self) -> str:
+        changed = listed([change.name for change in self.named] or ["nothing"], "or")
+        facts = {"stops": f"{self.predicted.stops}", "may have changed": changed}
+        facts["as large a misfit by chance"] = figure(self.p_value)
+        holds = "holds" if self.passed else "does not hold"
+        return text_card(f"Check of {self.calibration.session_name!r}: {holds}", facts)
 
     @property
     def calibration(self) -> Calibration:
