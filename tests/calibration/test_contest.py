@@ -16,7 +16,7 @@ from support.sound_findings import SOUND, changed, directions
 
 import visioncal
 from visioncal.calibration.pipeline.judging import findings_of
-from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of, view_evidence
 from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import Findings, JudgedArm
@@ -151,6 +151,26 @@ def test_a_camera_that_moved_once_is_where_it_stood_last(mount, first, by_m):
     # A check of later stops reads transforms, lens and board as one.
     prior = CalibrationPrior.of(result_of(known))
     assert prior.state.edges[0] == pytest.approx(edge.matrix)
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_residuals_and_noise_beside_a_step_are_those_of_the_result(mount):
+    """A camera that moved leaves what it would have left had it stood still."""
+    options = replace(FINE, mount=mount, views=20, seed=4)
+    cell, moved = simulate(options), simulate(replace(options, camera_moved_m=1e-3))
+    mixed = showing(cell, [*cell.corners[:10], *moved.corners[10:]])
+    still, stepped = (calibrated(one, joints=False) for one in (cell, mixed))
+    before, after = map(result_of, (still, stepped))
+    # A second pose of the camera takes six more values of 20 views.
+    assert after.rms.mm < 1.1 * before.rms.mm
+    assert after.rms.px < 1.1 * before.rms.px
+    assert after.validation.held_out.mm < 1.2 * before.validation.held_out.mm
+    assert max(view.residual_mm for view in after.views) < 1.0
+    low_mm, high_mm = before.uncertainty.noise_95["robot_translation_mm"]
+    assert low_mm < after.noise["robot_translation_mm"] < high_mm
+    # What the viewer and the report draw over each image.
+    away = [each.predicted_px - each.corners.px for each in view_evidence(stepped)]
+    assert np.sqrt(np.mean(np.concatenate(away) ** 2)) < 1.1 * after.rms.px
 
 
 @pytest.mark.parametrize(("joint", "by_deg"), [(1, 0.3), slow(0, 0.3)])

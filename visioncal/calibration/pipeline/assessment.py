@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
     with_lasting_errors,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
-from visioncal.calibration.pipeline.ended import as_it_ends
+from visioncal.calibration.pipeline.ended import as_it_ends, as_it_went
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.cell import Cell, ObservationRow
@@ -54,6 +54,8 @@ class FitAssessment:
 
     cell_fit: CellFit  # The fit, with what it is of.
     fit: Fit  # The same with its covariance from all sources.
+    # The same with what moved at once where it stood before and after: residuals and noise are its.
+    went: CellFit
     steps: tuple[Step, ...]  # Steps that the residuals show, likeliest first.
     arms: Mapping[str, ArmReport]  # Findings about the arms, by robot.
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
@@ -129,7 +131,8 @@ class FitAssessment:
     @cached_property
     def intervals(self) -> FloatArray:
         """(r, 2, 2) 95 % intervals of the robots' noise; see `estimation.intervals`."""
-        return noise_intervals(self.fit.problem, self.fit.state, self.fit.noise)
+        fit = self.went.fit if self.went is not self.cell_fit else self.fit
+        return noise_intervals(fit.problem, fit.state, fit.noise)
 
     @property
     def noise_95(self) -> dict[str, Intervals]:
@@ -181,19 +184,21 @@ def assess_fit(
     if cell_fit.has_links and (between := between_boards_and_arm(fit, cell.session.boards)).any():
         by_source[BOARD_OR_ARM] = between
     fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, by_source=by_source)
-    held_out = left_out(cell_fit)
+    went = as_it_went(cell_fit, steps) if is_fit else cell_fit
+    held_out = left_out(went)
     (faults, reasons, marginal), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(
         cell_fit,
         fit,
+        went,
         steps,
         {name: report_of(arm, fit, middles, convention) for name, arm in cell_fit.arms.items()},
         held_out,
         movements(cell_fit),
         faults,
         marginal,
-        _views(observed, cell, cell_fit, held_out, reasons),
-        _sigmas(cell_fit),
+        _views(observed, cell, went, held_out, reasons),
+        _sigmas(went),
     )
 
 

@@ -7,9 +7,11 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import STEP, covariance_from_other_sources
 from visioncal.calibration.stages.arms import Arm
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.fit import Fit
+from visioncal.estimation.moves import moved
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import Solution
@@ -37,6 +39,21 @@ def as_it_ends(fit: Fit, problem: Problem, arms: Mapping[str, Arm], steps: Seque
     by_source = {**fit.by_source, **{name: source[part] for name, source in sources.items()}}
     by_source[STEP] = spread + wide.by_noise[part] - ended.by_noise
     return replace(ended, by_source=by_source)
+
+
+def as_it_went(cell_fit: CellFit, steps: Sequence[Step]) -> CellFit:
+    """The fit with the likeliest step, if that is of a frame, as a move; itself after none.
+
+    Residuals are those of it: before and after, each view by the frame as it stood then.
+    """
+    if not steps or steps[0].kind != FRAME:
+        return cell_fit
+    inliers, frame = cell_fit.inlier_fit, steps[0].of
+    for step in (*steps[0].earlier, steps[0]):
+        problem, fit, move = moved(inliers.problem, inliers.fit, frame, step.stop, step.value)
+        inliers = replace(inliers, problem=problem, fit=fit, moves=(*inliers.moves, move))
+        frame = move.twin
+    return replace(cell_fit, inlier_fit=inliers.refitted())
 
 
 def _after(fit: Fit, step: Step) -> tuple[Fit, IntArray, State]:

@@ -448,7 +448,8 @@ def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]
 
 def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
-    cell_fit, boards, fit = run.cell_fit, tuple(run.session.boards.values()), run.assessment.fit
+    cell_fit, boards = run.assessment.went, tuple(run.session.boards.values())
+    fit = cell_fit.fit
     state, evidence = fit.state, dict[int, Any]()
     for seen in seen_rows(cell_fit, run):
         poses = zip(seen.problem.measured(state), seen.problem.predicted(state), strict=True)
