@@ -31,12 +31,18 @@ def with_print(cell, shifts_m):
     return showing(cell, found)
 
 
-def on_board(cell):
-    """The errors of the places of a cell's corners, by its images."""
+def on_board_state(cell):
+    """A cell's state with lenses, and the poses of its boards."""
     known = known_of(cell)
     for stage in STAGES:
         if stage.name in ("intrinsics", "pnp"):
             known = stage.run(known)
+    return known
+
+
+def on_board(cell):
+    """The errors of the places of a cell's corners, by its images."""
+    known = on_board_state(cell)
     lens = known.lenses["cam"].camera
     poses = {view: pose.cam_from_target[0] for view, pose in known.poses.items()}
     corners = {view: known.corners[view] for view in poses}
@@ -62,6 +68,24 @@ def test_a_print_that_is_off_everywhere_has_its_size():
     found = on_board(with_print(simulate(CellOptions(target=BOARD, seed=4)), shifts))
     assert found.p_value < FALSE_ALARM
     assert found.sigma_m == pytest.approx(2e-4, rel=0.25)
+
+
+@pytest.mark.parametrize("at", [0, 5, 11])
+def test_a_board_that_stands_still_before_a_fixed_camera_is_not_loose(at):
+    """Each corner then lies at one place of the image, where the lens may err as the print may."""
+    cell = simulate(CellOptions(target=BOARD, pixel_sigma_px=0.01, seed=4))
+    known, rng = on_board_state(cell), np.random.default_rng(at)
+    view = sorted(known.corners)[at]
+    corners, pose = known.corners[view], known.poses[view].cam_from_target[0]
+    seen = {
+        time: replace(corners, px=corners.px + rng.normal(0.0, 0.005, corners.px.shape))
+        for time in range(20)
+    }
+    found = point_errors(BOARD, known.lenses["cam"].camera, seen, dict.fromkeys(seen, pose))
+    # All are off by 0.01 px; the print would be by as much on the board, which tilts by 45 deg at
+    # most; its estimate of some 50 directions scatters by a tenth.
+    metres_by_px = pose[2, 3] / known.lenses["cam"].camera.matrix[0]
+    assert found.sigma_m < 1.3 * np.sqrt(2.0) * 0.01 * metres_by_px
 
 
 @pytest.mark.parametrize("every", [1, slow(2)])

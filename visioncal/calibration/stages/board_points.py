@@ -186,8 +186,9 @@ def _point_errors(
         flat = by_places.reshape(-1, count)
         inner = flat.T @ flat
         values, vectors = np.linalg.eigh(inner)
-        # Directions that poses, lens and shape do not leave open, by the information they leave.
-        is_open = values > 1e-4 * np.median(values)
+        # Directions that poses, lens and shape leave open, by the information left: of corners that
+        # stay where they are in the image, the smooth field takes most.
+        is_open = values > 1e-4 * values[-1]
         values, vectors = values[is_open], vectors[:, is_open]
         rows = by_places @ (vectors / np.sqrt(values))
         found = np.einsum("nai,na->i", rows, pulls)
@@ -229,7 +230,8 @@ def _point_errors(
     scale = spread / mean
     p_value = float(chdtrc(mean / scale, found @ found / scale))
     noise = mean / len(values)
-    square = float(np.mean((found**2 - noise) / values))
+    # Each direction counts by its information, so that one that hardly shows adds no noise.
+    square = float(values @ (found**2 - noise) / (values @ values))
     sigma_m = float(np.sqrt(max(square, 0.0)))
     none = np.zeros(0, dtype=np.int64)
     return PointErrors(sigma_m, p_value if square > 0.0 else 1.0, none, 0.0, noise**0.5)
