@@ -6,7 +6,6 @@ perturbations act on the right, in the local frame: `T * exp(twist)`.
 """
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.types import FloatArray, Mount
 
@@ -67,9 +66,28 @@ def cross(vectors: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def exp(twists: FloatArray) -> FloatArray:
-    """Exponential map: (..., 6) twists (rotation [rad], translation [m]) to (..., 4, 4)."""
-    flat = RigidTransform.from_exp_coords(twists.reshape(-1, 6)).as_matrix()
-    return np.asarray(flat, dtype=float).reshape(*twists.shape[:-1], 4, 4)
+    """Exponential map: (..., 6) twists (rotation [rad], translation [m]) to (..., 4, 4).
+
+    Rodrigues' formula, component by component, takes half of the time of scipy's.
+    """
+    wx, wy, wz, tx, ty, tz = np.ascontiguousarray(twists.reshape(-1, 6).T)
+    # No angle is zero: what would need a series there is multiplied by squares of the rotation.
+    angle = np.sqrt(np.maximum(wx * wx + wy * wy + wz * wz, 1e-300))
+    sinc, half = np.sin(angle) / angle, np.sin(0.5 * angle) / angle
+    versine, rest = 2.0 * half * half, (1.0 - sinc) / (angle * angle)
+    sx, sy, sz = sinc * wx, sinc * wy, sinc * wz
+    vx, vy, vz = versine * wx, versine * wy, versine * wz
+    cx, cy, cz = wy * tz - wz * ty, wz * tx - wx * tz, wx * ty - wy * tx
+    matrices = np.zeros((len(angle), 4, 4))
+    entries = matrices.reshape(-1, 16).T
+    entries[0], entries[1], entries[2] = 1.0 - vy * wy - vz * wz, vx * wy - sz, vx * wz + sy
+    entries[4], entries[5], entries[6] = vx * wy + sz, 1.0 - vx * wx - vz * wz, vy * wz - sx
+    entries[8], entries[9], entries[10] = vx * wz - sy, vy * wz + sx, 1.0 - vx * wx - vy * wy
+    entries[3] = tx + versine * cx + rest * (wy * cz - wz * cy)
+    entries[7] = ty + versine * cy + rest * (wz * cx - wx * cz)
+    entries[11] = tz + versine * cz + rest * (wx * cy - wy * cx)
+    entries[15] = 1.0
+    return matrices.reshape(*twists.shape[:-1], 4, 4)
 
 
 def log(matrices: FloatArray) -> FloatArray:
@@ -141,7 +159,7 @@ def inverse_right_jacobian(twists: FloatArray) -> FloatArray:
     translation, as for dual rotations.
     """
     # Components first: sums over rows of three numbers would take most of the time.
-    rotation, translation = np.ascontiguousarray(np.moveaxis(twists, -1, 0)).reshape(2, 3, -1)
+    rotation, translation = np.ascontiguousarray(twists.reshape(-1, 6).T).reshape(2, 3, -1)
     squared, dot = np.sum(rotation**2, axis=0), np.sum(rotation * translation, axis=0)
     coefficient = _log_series(squared)
     derivative = 1 / 720 + squared * (2 / 30240 + squared * 3 / 1209600)

@@ -112,7 +112,7 @@ def _quaternions(motions: FloatArray) -> FloatArray:
 def _relative(unit: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
     """Quaternions (..., 4, n) of `inv(q_j) q_i`, the scalar not negative, of (..., 4, m) units."""
     q, p = np.take(unit, first, axis=-1), np.take(unit, second, axis=-1)
-    (qw, qx, qy, qz), (pw, px, py, pz) = (np.moveaxis(each, -2, 0) for each in (q, p))
+    (qw, qx, qy, qz), (pw, px, py, pz) = ([each[..., at, :] for at in range(4)] for each in (q, p))
     found = np.empty(q.shape)
     scalar = pw * qw + px * qx + py * qy + pz * qz
     sign = np.copysign(1.0, scalar)

@@ -9,9 +9,10 @@ of noise are the sizes; each may be estimated (Patterson and Thompson 1971; in t
 of units are eliminated unit by unit, so that an evaluation is linear in the number of units.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -123,7 +124,9 @@ class Units:
     def total(self, logs: FloatArray) -> FloatArray:
         """Covariances (u, d, d) of the residuals at (k,) logarithms of the sizes."""
         squares = np.exp(2.0 * logs[self.sizes])
-        return np.asarray(self.known + np.tensordot(squares, self.parts, axes=1))
+        # One product of matrices: NumPy's `tensordot` takes as long again for its axes.
+        parts = squares @ self.parts.reshape(len(squares), math.prod(self.known.shape))
+        return np.asarray(self.known + parts.reshape(self.known.shape))
 
     def white(self, logs: FloatArray) -> "WhiteUnits":
         """The units in units of their noise, at (k,) logarithms of the sizes."""
@@ -173,23 +176,25 @@ class MixedModel:
         information[is_random, is_random] += 1.0 / variances
         root = covariance_root(information)
         values = root @ (root.T @ (known.gradient + gram(at.jacobian, at.residuals)))
-        left = replace(at, residuals=at.residuals - at.jacobian @ values)
+        left = WhiteUnits(at.whitening, at.jacobian, at.residuals - at.jacobian @ values)
         value = float(np.log(variances).sum() + np.sum(values[is_random] ** 2 / variances))
         value -= 2.0 * float(np.linalg.slogdet(at.whitening)[1].sum() + np.linalg.slogdet(root)[1])
         value += float(np.sum(left.residuals**2))
         value -= float(values @ (2.0 * known.gradient - known.information @ values))
-        flat = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
-        estimate = MixedEstimate(0.5 * value, *flat, logs, values, root)
-        gradient, curvature = self._slopes(estimate, left) if is_sloped else flat
+        gradient, curvature = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
+        if is_sloped:
+            gradient, curvature = self._slopes(logs, values, root, left)
         if self.prior is not None:
             prior = self.prior.at(logs)
             gradient, curvature = gradient + prior.gradient, curvature + prior.curvature
             value += 2.0 * prior.value
-        return replace(estimate, value=0.5 * value, gradient=gradient, curvature=curvature)
+        return MixedEstimate(0.5 * value, gradient, curvature, logs, values, root)
 
-    def _slopes(self, estimate: MixedEstimate, at: WhiteUnits) -> tuple[FloatArray, FloatArray]:
+    def _slopes(
+        self, logs: FloatArray, values: FloatArray, root: FloatArray, at: WhiteUnits
+    ) -> tuple[FloatArray, FloatArray]:
         """Gradient (k,) and average information (k, k) by the logarithms of the sizes."""
-        variances, values, root = np.exp(2.0 * estimate.logs), estimate.values, estimate.root
+        variances = np.exp(2.0 * logs)
         by_size, unit = np.zeros(len(variances)), self.units
         is_random = self.shares.any(axis=1)
         random_variances = self.shares[is_random] @ variances
@@ -208,13 +213,11 @@ class MixedModel:
         remaining = back @ remaining @ at.whitening
         pulled = back @ at.residuals[:, :, None]
         pulls = (unit.parts @ pulled)[..., 0]
-        traces = np.tensordot(unit.parts, remaining, axes=([1, 2, 3], [0, 1, 2]))
+        traces = unit.parts.reshape(len(unit.parts), remaining.size) @ remaining.ravel()
         squares = variances[unit.sizes]
         by_size[unit.sizes] += squares * (traces - np.sum(pulls * pulled[..., 0], axis=(1, 2)))
         working = at.jacobian @ along
-        working[:, :, unit.sizes] += at.whitening @ np.moveaxis(
-            2.0 * squares[:, None, None] * pulls, 0, 2
-        )
+        working[:, :, unit.sizes] += at.whitening @ (2.0 * squares * pulls.transpose(1, 2, 0))
         products = self.common.information @ along
         average = gram(working, working) + along.T @ products
         projected = root.T @ (gram(at.jacobian, working) + products)
@@ -312,10 +315,15 @@ def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatAr
     # Beside a direction that is steeper by far, one that is flat would be rounding: the curvature
     # is at least so much of that of each size alone.
     flat = max(0.1, ROUNDING * float(values.max(initial=0.0)))
-    curvature = (vectors * (np.maximum(values, flat) + damping)) @ vectors.T
-    slope = scale * slope
-    promised = 0.5 * float(slope @ np.linalg.solve(curvature, slope))
-    moved, rest = np.zeros(len(inside)), np.ones(len(inside), bool)
+    values, slope = np.maximum(values, flat) + damping, scale * slope
+    along = slope @ vectors
+    promised, moved = 0.5 * float(along @ (along / values)), -(vectors @ (along / values))
+    beyond = np.abs(scale * moved) > _LONGEST_STEP
+    if not beyond.any():
+        step[inside] = scale * moved
+        return step, promised
+    moved, rest = np.clip(moved, -_LONGEST_STEP / scale, _LONGEST_STEP / scale), ~beyond
+    curvature = (vectors * values) @ vectors.T
     while rest.any():
         pull = (slope + curvature @ np.where(rest, 0.0, moved))[rest]
         moved[rest] = -np.linalg.solve(curvature[rest][:, rest], pull)

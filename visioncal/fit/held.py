@@ -85,9 +85,11 @@ def with_small_sizes(fit: Fit) -> Fit:
             # A size of zero is as likely as all of these together.
             weights = np.exp(gains - np.logaddexp.reduce([*gains, np.log(len(gains))]))
             slope = covariance[:, at] @ inner
-            for size, weight in zip(sizes.tolist(), weights.tolist(), strict=True):
-                posterior = np.linalg.inv(score.information + np.eye(len(at)) / size**2)
-                away = posterior @ score.pull - values[at]
-                more = posterior - covariance[at[:, None], at] + np.outer(away, away)
-                added += slope @ (weight * more) @ slope.T
+            # All sizes at once.
+            posterior = np.linalg.inv(
+                score.information + np.eye(len(at)) / sizes[:, None, None] ** 2
+            )
+            away = posterior @ score.pull - values[at]
+            more = posterior - covariance[at[:, None], at] + away[:, :, None] * away[:, None]
+            added += slope @ np.sum(weights[:, None, None] * more, axis=0) @ slope.T
     return fit.considering(added)

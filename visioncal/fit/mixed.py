@@ -106,6 +106,18 @@ class Mixed:
             found[at][np.append(body.columns, self.count)] = np.arange(len(body.columns) + 1)
         return found
 
+    @cached_property
+    def with_residual(self) -> list[tuple[IntArray, list[IntArray]]]:
+        """(c + 1,) places of each term's columns and residual; and of each part's, of its body."""
+        p = self.count
+        return [
+            (
+                np.append(term.columns, p),
+                [self.places[part.body][np.append(part.columns, p)] for part in term.parts],
+            )
+            for term in self.terms
+        ]
+
     def assembled(self, logs: FloatArray) -> tuple[list[tuple[FloatArray, FloatArray]], FloatArray]:
         """Information: of each body's units (u, m, m) and (u, m, c + 1); common (p + 1, p + 1)."""
         weights, p = weights_at(logs), self.count
@@ -117,14 +129,12 @@ class Mixed:
             )
             for body in self.bodies
         ]
-        for term in self.terms:
-            at = np.append(term.columns, p)
+        for term, (at, of_parts) in zip(self.terms, self.with_residual, strict=True):
             _add(common, at, weights[term.size] * term.common)
-            for part in term.parts:
+            for part, where in zip(term.parts, of_parts, strict=True):
                 errors, cross = units[part.body]
                 errors += weights[term.size] * part.errors
-                where = self.places[part.body][np.append(part.columns, p)]
-                cross[:, :, where] += weights[term.size] * part.cross
+                _add_columns(cross, where, weights[term.size] * part.cross)
         return units, common
 
     def at(self, logs: FloatArray, *, is_sloped: bool = True) -> Estimate:
@@ -182,22 +192,20 @@ class Mixed:
         at_errors = [
             np.zeros((self.sizes, *eliminated.errors.shape)) for eliminated in found.bodies
         ]
-        for term in self.terms:
+        for term, (columns, of_parts) in zip(self.terms, self.with_residual, strict=True):
             if term.size < 0:
                 continue
-            columns = np.append(term.columns, p)
             x = values[columns]
             pull = term.common @ x
             square = float(x @ pull)
             absorbed = float(np.vdot(term.common, covariance[columns[:, None], columns]))
-            for part in term.parts:
-                e, columns = found.bodies[part.body].errors, np.append(part.columns, p)
-                cross = part.cross.reshape(-1, len(columns))
+            for part, where in zip(term.parts, of_parts, strict=True):
+                e, cross = found.bodies[part.body].errors, part.cross.reshape(-1, len(where))
                 by_error = (part.errors @ e[:, :, None])[:, :, 0]
-                by_common = (cross @ values[columns]).reshape(e.shape)
+                by_common = (cross @ np.append(values[part.columns], -1.0)).reshape(e.shape)
                 square += float(np.vdot(e, by_error + 2.0 * by_common))
                 absorbed += float(np.vdot(part.errors, insides[part.body]))
-                spread = np.take(spreads[part.body], self.places[part.body][columns], axis=2)
+                spread = np.take(spreads[part.body], where, axis=2)
                 absorbed += 2.0 * float(np.vdot(part.cross, spread))
                 at_errors[part.body][term.size] += by_error + by_common
                 pulls[term.size, part.columns] += (e.ravel() @ cross)[:-1]
@@ -217,11 +225,36 @@ class Mixed:
 
 
 def _add(whole: FloatArray, at: IntArray, more: FloatArray) -> None:
-    """Adds to some rows and columns (c,), in ascending order, of a matrix."""
+    """Adds to some rows and columns (c + 1,), in ascending order, of a matrix; the last is last."""
     if len(at) == len(whole):
         whole += more
+    elif run := _run(at):
+        # Several times as fast as by indices.
+        whole[run, run] += more[:-1, :-1]
+        whole[run, -1] += more[:-1, -1]
+        whole[-1, run] += more[-1, :-1]
+        whole[-1, -1] += more[-1, -1]
     else:
         whole[at[:, None], at] += more
+
+
+def _add_columns(whole: FloatArray, at: IntArray, more: FloatArray) -> None:
+    """Adds to some columns (c + 1,) of an array (u, m, n); the last is last."""
+    if len(at) == whole.shape[2] and _run(at):
+        whole += more
+    elif run := _run(at):
+        whole[:, :, run] += more[:, :, :-1]
+        whole[:, :, -1] += more[:, :, -1]
+    else:
+        whole[:, :, at] += more
+
+
+def _run(at: IntArray) -> slice | None:
+    """The run that (c + 1,) ascending indices but the last are, if they are one."""
+    count = len(at) - 1
+    if count < 1 or at[-2] - at[0] != count - 1:
+        return None
+    return slice(int(at[0]), int(at[0]) + count)
 
 
 def _widened(array: FloatArray) -> FloatArray:

@@ -345,13 +345,13 @@ def reproject(
         image and zero derivatives, so that a solver rejects the step that moves it there.
     """
     # By components, as batched products of matrices this small are mostly overhead.
-    rotation = np.ascontiguousarray(np.moveaxis(cam_from_target[:, :3, :3], 0, 2))
+    rotation = np.ascontiguousarray(cam_from_target[:, :3, :3].transpose(1, 2, 0))
     rotation = rotation[:, :, stack.view_of]
     px, py, pz = stack.points.T
     points_cam = (rotation[:, 0] * px + rotation[:, 1] * py + rotation[:, 2] * pz).T
     points_cam = points_cam + cam_from_target[:, :3, 3][stack.view_of]
     projection = project_with_jacobian(camera, points_cam, lens=lens)
-    by_cam = np.ascontiguousarray(np.moveaxis(projection.jacobian_point, 2, 0))
+    by_cam = np.ascontiguousarray(projection.jacobian_point.transpose(2, 0, 1))
     columns = rotation[:, :, :, None]
     bx, by, bz = (
         by_cam[0] * columns[0, at] + by_cam[1] * columns[1, at] + by_cam[2] * columns[2, at]
