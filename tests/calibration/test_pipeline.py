@@ -22,8 +22,8 @@ from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.core.types import Camera, Target
+from visioncal.core.transforms import compose, exp, invert, log, pose_difference
+from visioncal.core.types import MOUNTS, Camera, Target
 from visioncal.core.verdict import NOTE
 from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
@@ -332,6 +332,29 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
         (noise_px,) = known.cell_fit.linearised_corners.sigmas_px
         assert noise_px == pytest.approx(options.pixel_sigma_px, rel=0.5)
     assert limits[0] < np.mean(surprises) < limits[1]
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_sigmas_beside_a_lens_that_counts_as_exact_say_what_a_pixel_of_it_moves(mount):
+    """The sentence is a derivative of the fit: a lens that is a bit off moves the camera by it."""
+    cell = simulate(replace(FINE, mount=mount, seed=2))
+
+    def known(*off_px, **table):
+        return calibrated(cell, session=with_camera(cell, np.array(off_px), **table))
+
+    def said(run):
+        return [found.words for found in run.verdict.findings if found.kind == "given_lens"]
+
+    right = known(0, 0, 0, 0, **HOLD)
+    assert right.verdict.status == "good"
+    (words,) = said(right)
+    focal_mm, _, _, centre_deg = map(float, re.findall(r"(\S+) (?:mm|deg)\b", words))
+    for off_px, place, figure in (((0.2, 0.2, 0, 0), 0, focal_mm), ((0, 0, 0.2, 0), 1, centre_deg)):
+        poses = (run.assessment.edges["cam"].matrix for run in (right, known(*off_px, **HOLD)))
+        # The sentence has two digits, and the centre's other axis may move it by a bit more.
+        assert pose_difference(*poses)[place] == pytest.approx(0.2 * figure, rel=0.1)
+    assert not said(known(0, 0, 0, 0, matrix_sigma_px=0.5))
+    assert not said(calibrated(simulate(replace(FINE, mount=mount, state_intrinsics=False))))
 
 
 @pytest.mark.slow

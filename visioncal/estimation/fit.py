@@ -398,10 +398,13 @@ class Fit:
         """
         size, last = self.problem.size, errors.is_time_correlated
         fit = self.beside_lasting(robot, errors) if last.any() else self
-        information = fit.with_arm(robot, errors).equations[0]
-        first = fit.problem.size
-        fitted = covariance_among(information[:first, :first], fit.problem.moving)
-        return np.asarray((fitted @ information[:first, first:])[:size] * ~last)
+        return np.asarray(-fit.response(arm_effect(errors, robot, "arm"))[:size] * ~last)
+
+    def response(self, effect: Effect) -> FloatArray:
+        """(p, c) Jacobian of the estimates by c values of an effect that the fit has as zero."""
+        information, first = self.with_columns(effect).equations[0], self.problem.size
+        fitted = covariance_among(information[:first, :first], self.problem.moving)
+        return np.asarray(-fitted @ information[:first, first:])
 
     def covariance(self, *unknowns: tuple[str, str]) -> FloatArray:
         """(c, c) covariance of some unknowns from all sources, in their order."""

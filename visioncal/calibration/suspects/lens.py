@@ -14,13 +14,14 @@ from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, CONTRADICTION
-from visioncal.core.number_format import counted, figure
+from visioncal.core.number_format import counted, figure, mm_and_deg
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import moved_mahalanobis_sq
+from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.estimation.steps import Step
 from visioncal.model.effects.board_sags import BoardSags
@@ -53,8 +54,28 @@ def _stated(run: RunState) -> Iterator[Finding]:
     """Stated intrinsics and noise of corners that the corners contradict."""
     fitted = run.assessment.fit
     for camera in fitted.unknowns.of(unknowns.LENS):
-        for finding in _of_camera(run.assessment, camera):
+        for finding in (*_of_camera(run.assessment, camera), *_taken_as_exact(run, camera)):
             yield finding.of("" if camera == ONLY_CAMERA else camera)
+
+
+def _taken_as_exact(run: RunState, camera: str) -> Iterator[Finding]:
+    """The condition of all sigmas beside a given lens that counts as exact, by its derivative."""
+    fitted, lens = run.assessment.fit, (unknowns.LENS, camera)
+    scene = fitted.camera_parameters.problems[camera].scene
+    is_exact = not scene.estimated and scene.matrix_sigma_px is None
+    if not is_exact or len(fitted.unknowns.columns(lens)) or camera not in fitted.frames:
+        return
+    by_px = run.cell_fit.lens_changes[camera] / fitted.camera(camera).matrix[0]
+    moves = fitted.response(Effect.free("a given lens", by_sensor=by_px))
+    moves = moves[fitted.unknowns[unknowns.EDGE, camera]]
+    far_mm, far_deg = 1e3 * np.linalg.norm(moves[3:], axis=0), np.linalg.norm(moves[:3], axis=0)
+    (focal, *centre) = zip(far_mm.tolist(), np.rad2deg(far_deg).tolist(), strict=True)
+    yield Finding(
+        "given_lens",
+        "Sigmas hold if the given lens is exact, as no matrix_sigma_px is stated: 1 px of its "
+        f"focal length moves the camera by {mm_and_deg(*focal)}, 1 px of its centre by up to "
+        f"{mm_and_deg(*np.max(centre, axis=0).tolist())}.",
+    )
 
 
 def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:

@@ -97,6 +97,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     lens.MODEL,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,
+    Suspect("given_lens", is_doubt=False, of_result=True),
     board.SIZE,
     board.SHAPE,
     board.PRINT,
