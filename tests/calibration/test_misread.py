@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.cells import known_of, pairs_session
 from support.commands import visioncal as typed
+from support.depth_cells import SMALL
 from support.edited import rewritten
 from support.following import follow, printed_commands
 from support.fuzz.mistakes import HALF_TURNS, MISTAKES, Poses, numbers, sound
@@ -738,7 +739,7 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
 
 
 def test_poses_are_left_handed_where_markers_show_that_images_are_not_mirrored(tmp_path):
-    cell = simulate(CellOptions(views=14, seed=3))
+    cell = simulate(CellOptions(camera=SMALL, blur_px=0.5, views=14, seed=3))
     write_session(cell, tmp_path / "cell")
     # In a frame whose y points the other way.
     turned = [POSE[at] for at in (1, 3, 5)]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import visioncal
+from support.depth_cells import SMALL
 from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
@@ -21,7 +22,7 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.depth import read_depth
-from visioncal.simulation import cell_session, read_cell, simulate
+from visioncal.simulation import CAMERAS, cell_session, read_cell, simulate
 
 # Chi-square of six exceeds this in one case of a thousand.
 MOST = 22.5
@@ -46,10 +47,13 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def seen(place):
-    """A cell with images and touches, calibrated, and five stops of another recording of it."""
+    """A cell with images and touches, calibrated, and four stops of another recording of it."""
     folder, out, fresh = place / "cell", place / "out", place / "fresh"
-    done("simulate", folder, "--views", 8, "--touches")
-    done("simulate", fresh, "--views", 4, "--recording", 1)
+    with pytest.MonkeyPatch.context() as patch:
+        # To draw and search all pixels takes half of the fixture's time.
+        patch.setitem(CAMERAS, "wide", SMALL)
+        done("simulate", folder, "--views", 8, "--touches")
+        done("simulate", fresh, "--views", 4, "--recording", 1)
     done("calibrate", folder, "-o", out)
     return folder, out, fresh
 
