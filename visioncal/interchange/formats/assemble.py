@@ -201,10 +201,16 @@ def _beside_axis(session: Session) -> Iterator[str]:
     # No lens sees farther from its axis than half a right angle to another one.
     is_along = sign * places[:, axis] > np.sqrt(0.5) * np.linalg.norm(places, axis=1)
     if session.mount in MOUNTS and (axis, sign) != (2, 1.0) and is_along.all():
+        # Behind a lens stands what OpenGL's camera sees, and the camera before its target.
+        which = (
+            "in the frame of OpenGL, Blender or a simulator (y up, -z forward), or are inverse, "
+            "those of the camera in the target (--camera-inverse)"
+            if name == "-z"
+            else "in the frame of the camera's body (camera_link has x forward), or of a tracker"
+        )
         yield (
             f"The targets stand along the camera's {name}, and before a lens they stand along its "
-            "z: their poses are in the frame of the camera's body (camera_link has x forward), or "
-            "of a tracker. The result is that frame's, too."
+            f"z: their poses are {which}. The result is that frame's, too."
         )
 
 

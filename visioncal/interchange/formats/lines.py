@@ -41,6 +41,7 @@ _MOVED = re.compile(rf"\bmove[jlpc]\s*\(\s*(?:get_inverse_kin\s*\(\s*)?({_LITERA
 _PARTS = ("x", "y", "z", "w")
 # A list within a line of text, and one behind the count of its numbers, as `Q[6]{..}` of RobWork.
 _INNER = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
+_REMARK = re.compile(r"\s*(?:\[[^\]]*\]|\([^)]*\))(?=.*:\s*$)")
 COUNTED = re.compile(r"\s*\w*\[[0-9]+\]\s*\{")
 # Lines with their places.
 _Lines: TypeAlias = Sequence[tuple[str, str]]
@@ -87,7 +88,8 @@ def _stops(lines: _Lines) -> list[_Lines]:
         if not once.any() and len(words) > 1 and len(same) == 1:
             # Headings in turn: the first begins a stop.
             once = np.array([line == first for _, line in lines], dtype=bool)
-        is_regular = same == {once.sum()} or 2 * once.sum() >= words.total()
+        # A title may stand above all of them.
+        is_regular = same in ({once.sum()}, {once.sum() - 1}) or 2 * once.sum() >= words.total()
         marks = once if is_regular else counts == 0
         marks = np.array(named) == most if count > 2 else marks
     if 2 * len(starts := np.flatnonzero(marks & (counts > 0))) > marks.sum():
@@ -144,6 +146,8 @@ def arrays_in(lines: _Lines) -> dict[str, FloatArray]:
 def blocks_of(lines: _Lines, path: Path) -> Fields | None:
     """Rows of several lines each, of a picture or below a line of words; None where none are."""
     rows = list[tuple[str, dict[str, object], dict[str, FloatArray]]]()
+    # Counts and remarks in brackets are no part of a heading: `matrix wMe[0] (size 4x4):`.
+    lines = [(place, _REMARK.sub("", line)) for place, line in lines]
     for stop in _stops(closed(lines)):
         arrays = arrays_in(stop)
         title = next((line for _, line in reversed(stop) if not _numbers_in(line)[1]), "")

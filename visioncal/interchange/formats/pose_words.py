@@ -46,6 +46,8 @@ BOTH_SIDES = (("a", "b"), ("h", "e"), ("t1", "t2"))
 _INITIALS = (("b", "base", "gefht", "gripper"), ("c", "cam", "tmo", "target"))
 # With these words between two frames the child is named first; otherwise second.
 CHILD_FIRST = {"2", "to", "in", "wrt"}
+# Frames in ViSP's names of homogeneous matrices, `wMe` and `cMo`: w, r or f of the robot's base.
+_HOMOGENEOUS = re.compile(r"\b(?:([wrf])M[ef]|cMo)\b")
 # Words of a script without spaces: flange, end, base, camera, board, robot, position, coordinates.
 _UNSPACED = re.compile(
     "(法[兰蘭]|末端|基座|相[机機]|[标標]定板|[机機]器人|[机機]械臂|位置|位姿|[坐座][标標])"
@@ -54,6 +56,7 @@ _UNSPACED = re.compile(
 
 def words_of(name: str) -> list[str]:
     """The words of a field's name, in small letters and without its unit."""
+    name = _HOMOGENEOUS.sub(lambda found: "base_gripper" if found[1] else "cam_target", name)
     plain = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", "_", without_unit(name)[0])
     plain = _UNSPACED.sub(r"_\1_", plain)
     words = [part for part in re.split(r"[\W_]+|(2)", plain.lower()) if part]

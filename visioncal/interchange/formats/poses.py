@@ -54,7 +54,12 @@ _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "w"),
     ("qx", "qy", "qz"),
     *dict.fromkeys(tuple(form.names.split()) for form in POSE_FORMS.values()),
+    ("ax", "ay", "az"),
 )
+# Axis times angle, which accelerations are called, too; and its largest length [rad].
+_AXIS_NAMES, _LONGEST_AXIS = _ROTATION_NAMES[-1], 1.01 * np.pi
+# A column of a pose's number, of which the first letters are those of its side: `mqx`.
+_JOINED_NAME = re.compile(r"([a-z]{1,9}?)(q?[xyz]|qw)")
 
 
 def possible_poses(
@@ -270,6 +275,10 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
             position, rotation = (), tuple("xyzw")
         elif position and not rotation and ROTATION_WORDS & {*words} and words[0] not in PLACE:
             position, rotation = (), position
+        if rotation == _AXIS_NAMES:
+            vectors = np.stack([fields.numbers[named[each]] for each in rotation], axis=1)
+            is_turn = np.nanmax(np.linalg.norm(vectors, axis=1), initial=0.0) < _LONGEST_AXIS
+            rotation = rotation if is_turn else ()
         # Five and more of these are joints.
         if rotation and "q5" not in named:
             names = tuple(named[each] for each in rotation)
@@ -320,7 +329,22 @@ def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, st
         # The same numbers as an array.
         if name not in taken and prefix.rstrip(".") not in fields.numbers:
             groups[prefix].setdefault(last.lower(), name)
-    return groups
+    return _apart(groups)
+
+
+def _apart(groups: Mapping[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """The groups, and of their own poses whose names are joined to a side's: `mx .. mqw`."""
+    found: dict[str, dict[str, str]] = {}
+    for prefix, named in groups.items():
+        joined: dict[str, dict[str, str]] = defaultdict(dict)
+        for last, name in named.items():
+            if match := _JOINED_NAME.fullmatch(last):
+                joined[match[1]][match[2]] = name
+        whole = {letters: each for letters, each in joined.items() if len(each) == 7}
+        names = {name for each in whole.values() for name in each.values()}
+        found[prefix] = {last: name for last, name in named.items() if name not in names}
+        found |= {f"{prefix}{letters}_": each for letters, each in whole.items()}
+    return found
 
 
 def pose_names(
