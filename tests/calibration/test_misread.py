@@ -29,7 +29,7 @@ from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.run import STAGES
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.interchange.formats import (
@@ -923,3 +923,24 @@ def test_of_rivals_of_a_symmetric_board_those_are_where_the_robot_is(mount):
     guess = guessed(replace(poses, robot=robot, camera=numbers(rivals[np.arange(14), chosen])))
     assert "rotation vector" in guess.sentence
     assert "taken for Euler angles" in guess.sentence
+
+
+@pytest.mark.parametrize(
+    ("mount", "share", "by"),
+    [(MOUNTS[0], 30, -1), slow(MOUNTS[1], 20, 1), slow(MOUNTS[1], 8, -1)],
+)
+def test_poses_that_were_read_on_the_way_are_named_with_the_share_of_it(mount, share, by):
+    """Of a tracker, whose sightings have no image: each pose is between where the arm stood."""
+    rng = np.random.default_rng(3)
+    spread = rng.normal(size=(24, 6)) * np.repeat([0.5, 0.15], 3)
+    stood = exp(spread + np.array([3.0, 0.0, 0.0, 0.6, 0.0, 0.4]))
+    edges = exp(np.array([[0.1, 0.2, -1.5, 0.03, 0.05, 0.1], [3.0, 0.1, 0.2, 1.2, 0.1, 0.0]]))
+    noise = exp(rng.normal(size=(24, 6)) * np.repeat([5e-4, 2e-4], 3))
+    others = stood[np.clip(np.arange(24) + by, 0, 23)]
+    read = stood @ exp(0.01 * share * log(invert(stood) @ others))
+    carrying = stood if mount == MOUNTS[0] else invert(stood)
+    seen = invert(carrying @ edges[0]) @ edges[1] @ noise
+    (cause, *_) = visioncal.calibrate(pairs_session(mount, read, seen)).verdict.causes
+    assert cause.kind == "misread_poses"
+    words = "The arm moved between image and pose: with each pose moved away from the "
+    assert f"{words}{'next' if by > 0 else 'last'} stop by {share} % of the way" in cause.words

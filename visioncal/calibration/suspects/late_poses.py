@@ -6,12 +6,14 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import distances as residuals_of
 from visioncal.calibration.guess.fit import robust_fits
+from visioncal.calibration.guess.search import relative_angles
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.suspects.moved_views import IN_MOTION
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
-from visioncal.core.number_format import view_words
-from visioncal.core.transforms import distances, robot_part
-from visioncal.core.types import MOUNTS
+from visioncal.core.number_format import figure, view_words
+from visioncal.core.transforms import distances, exp, invert, log, robot_part
+from visioncal.core.types import MOUNTS, FloatArray, IntArray
 from visioncal.core.verdict import Finding, Option, calibrating, mending
 
 _KIND = "late_poses"
@@ -27,6 +29,11 @@ _OF_TIP = calibrating(
     "the other views alone.",
     "",
 )
+
+# Shares of the way to another stop that are tried.
+_SHARES = np.linspace(-0.4, 0.4, 81).round(2)
+# Rounds in which places between stops, by up to that share, converge to a thousandth.
+_ROUNDS = 8
 
 
 def by_joints(run: RunState) -> Iterator[Finding]:
@@ -90,6 +97,50 @@ def by_joints(run: RunState) -> Iterator[Finding]:
             _BY_JOINTS if is_flange else _OF_TIP,
             named,
         )
+
+
+def on_the_way(robot: FloatArray, camera: FloatArray, kept: IntArray) -> Finding | None:
+    """The finding that poses belong to places on the way to another stop; None where none fit.
+
+    Args:
+        robot: (m, 4, 4) poses, in the order of their stops.
+        camera: (p,) angles by which the camera turned between the pairs of the kept ones [rad].
+        kept: Indices of the poses that are compared.
+    """
+    found = list[tuple[float, float, str]]()
+    for which, by in (("next", 1), ("last", -1)):
+        for share in _SHARES:
+            stood = robot
+            # Poses that were read on the way are a share of that between where the arm stood.
+            for _ in range(_ROUNDS if share < 0.0 else 1):
+                stood = robot @ exp(share * _way(stood, by))
+            turned = stood[kept, :3, :3]
+            away = float(np.median(np.abs(relative_angles(turned) - camera)))
+            found.append((away, float(share), which))
+    (away, share, which), none = min(found), min(one for one in found if one[1] == 0.0)[0]
+    if CLEAR_RATIO * away > none:
+        return None
+    percent = f"{100.0 * abs(share):.0f} %"
+    words, when = "The arm moved between image and pose: ", "the image was taken later than that"
+    if which == "next" and share < 0.0:
+        when = "the pose was read later than that, with the arm on its way to the next stop"
+    elif which == "last" and share > 0.0:
+        when = "the arm had not arrived there yet, as of poses that were commanded"
+    towards = (
+        f"{'towards' if share > 0.0 else 'away from'} the {which} stop by {percent} of the way"
+    )
+    words += (
+        f"with each pose moved {towards}, robot and camera turn alike to "
+        f"{figure(np.rad2deg(away))} deg (median of all pairs), as read to "
+        f"{figure(np.rad2deg(none))} deg. So {when}."
+    )
+    return Finding("misread_poses", words, IN_MOTION)
+
+
+def _way(poses: FloatArray, by: int) -> FloatArray:
+    """(m, 6) twists from (m, 4, 4) poses to the next, or to the last by -1; none from an end."""
+    others = np.clip(np.arange(len(poses)) + by, 0, len(poses) - 1)
+    return log(invert(poses) @ poses[others])
 
 
 LATE_POSES = Suspect(

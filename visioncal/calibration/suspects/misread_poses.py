@@ -9,7 +9,7 @@ from itertools import islice, pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.guess.decide import POSE_OPTIONS
+from visioncal.calibration.guess.decide import POSE_OPTIONS, Guess
 from visioncal.calibration.guess.readings import OR_IMAGES
 from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
@@ -27,7 +27,7 @@ from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_fr
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.declared_frames import carried, on_another
-from visioncal.calibration.suspects.late_poses import by_joints
+from visioncal.calibration.suspects.late_poses import by_joints, on_the_way
 from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.mistaken_rows import Undoing
@@ -38,10 +38,9 @@ from visioncal.calibration.suspects.record import Edges, Record, StopOfRobot, ev
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
-from visioncal.core.number_format import figure, robot_words, view_words
-from visioncal.core.transforms import exp, invert, log
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.limits import FEWEST_COMPARED
+from visioncal.core.number_format import robot_words, view_words
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import (
     BY_HAND,
     CALIBRATE,
@@ -104,8 +103,6 @@ _REAL_PART = Remedy(
 )
 # A number that stands still does so to a digit; others vary by more [mm, deg].
 _DIGIT_MM, _DIGIT_DEG, _VARIES_MM, _VARIES_DEG = 1e-3, 2e-3, 20.0, 5.0
-# Shares of the way to another stop that are tried.
-_SHARES = np.linspace(-0.4, 0.4, 81).round(2)
 UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "
     "were misread cannot all be read anew from here. Or look how the poses were recorded, and how "
@@ -310,8 +307,11 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
     if apart := [*of_other_rows(run, guess.best.fit.score)]:
         yield from apart
         return
-    # Units that merely bring both sides nearer do not precede an axis that closes the chain.
-    unknown = [] if guess.best.fit.closes else [*_unrecorded(run)]
+    unknown = [*_unrecorded(run)]
+    if guess.best.fit.closes:
+        # Units that merely bring both sides nearer do not precede an axis that closes the chain;
+        # poses a bit on the way close it roughly.
+        unknown = [hint for hint in unknown if hint.do == IN_MOTION and not _is_counted(run, guess)]
     if guess.stands_out and all(hint.do in (UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
@@ -328,6 +328,12 @@ def _misread_poses(run: RunState, within: tuple[RunState, str] | None = None) ->
             step = mending("positions are read otherwise", option, write)
         yield Finding("misread_poses", guess.sentence, step)
     yield from unknown
+
+
+def _is_counted(run: RunState, guess: Guess) -> bool:
+    """Whether another reading is the likelier one, or a fit counts what poses on the way do."""
+    counted = ("stops_short", "moves_on")
+    return guess.stands_out or any(found.kind in counted for found in run.warnings)
 
 
 def _mirrored(run: RunState, found: Finding) -> Finding:
@@ -359,7 +365,7 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
         yield from other
         return
     alike = float(np.mean(away < _ALIKE_RAD))
-    if np.median(away) > _ALIKE_RAD and (late := _on_the_way(robot, by_camera, kept)) is not None:
+    if np.median(away) > _ALIKE_RAD and (late := on_the_way(robot, by_camera, kept)) is not None:
         yield late
         return
     if np.median(away) > _ALIKE_RAD and (side_name := _half_turned(pairs)):
@@ -418,46 +424,6 @@ def _still(robot: FloatArray) -> str:
                 "this column is not the robot's."
             )
     return ""
-
-
-def _on_the_way(robot: FloatArray, camera: FloatArray, kept: IntArray) -> Finding | None:
-    """The finding that poses belong to places on the way to another stop; None where none fit.
-
-    Args:
-        robot: (m, 4, 4) poses, in the order of their stops.
-        camera: (p,) angles by which the camera turned between the pairs of the kept ones [rad].
-        kept: Indices of the poses that are compared.
-    """
-    onwards = log(invert(robot[:-1]) @ robot[1:])
-    back = log(invert(robot[1:]) @ robot[:-1])
-    ways = {
-        "next": np.append(onwards, np.zeros((1, 6)), axis=0),
-        "last": np.append(np.zeros((1, 6)), back, axis=0),
-    }
-    found = list[tuple[float, float, str]]()
-    for which, way in ways.items():
-        for share in _SHARES:
-            turned = (robot @ exp(share * way))[kept, :3, :3]
-            away = float(np.median(np.abs(relative_angles(turned) - camera)))
-            found.append((away, float(share), which))
-    (away, share, which), none = min(found), min(one for one in found if one[1] == 0.0)[0]
-    if CLEAR_RATIO * away > none:
-        return None
-    percent = f"{100.0 * abs(share):.0f} %"
-    words, when = "The arm moved between image and pose: ", "the image was taken later than that"
-    if which == "next" and share < 0.0:
-        when = "the pose was read later than that, with the arm on its way to the next stop"
-    elif which == "last" and share > 0.0:
-        when = "the arm had not arrived there yet, as of poses that were commanded"
-    towards = (
-        f"{'towards' if share > 0.0 else 'away from'} the {which} stop by {percent} of the way"
-    )
-    words += (
-        f"with each pose moved {towards}, robot and camera turn alike to "
-        f"{figure(np.rad2deg(away))} deg (median of all pairs), as read to "
-        f"{figure(np.rad2deg(none))} deg. So {when}."
-    )
-    return Finding("misread_poses", words, IN_MOTION)
 
 
 def turned_boards(run: RunState) -> Iterator[Finding]:
