@@ -124,10 +124,11 @@ def quaternions(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     vector, scalar = rotations[:, after, before] - rotations[:, before, after], 1.0 + trace
     # Relative to the largest component, since a small one is mostly rounding.
     large = np.flatnonzero(trace < 0.0)
-    axis = diagonal[large].argmax(axis=1)
-    scalar[large] = vector[large, axis]
-    vector[large] = rotations[large, axis] + rotations[large, :, axis]
-    vector[large, axis] = 1.0 + 2.0 * diagonal[large, axis] - trace[large]
+    if len(large):
+        axis = diagonal[large].argmax(axis=1)
+        scalar[large] = vector[large, axis]
+        vector[large] = rotations[large, axis] + rotations[large, :, axis]
+        vector[large, axis] = 1.0 + 2.0 * diagonal[large, axis] - trace[large]
     return vector, scalar
 
 

@@ -310,10 +310,10 @@ def rows_apart(
     count = len(record.rows)
     behind = np.arange(count) >= np.arange(count)[:, None]
     ends = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
-    orders = [record.paired(order(len(record.views))) for order in ROW_ORDERS.values()]
+    orders = np.array([record.paired(order(len(record.views))) for order in ROW_ORDERS.values()])
     found = list[tuple[float, int, Mask]]()
     for edges in every:
-        squares = {by: edges.of(pair) for by, pair in pairs.items()}
+        squares = dict(zip(pairs, edges.of(np.array([*pairs.values()])), strict=True))
         for by in [*pairs][1:]:
             amid = _apart_amid(record, squares[0], squares[by], by)
             sides = np.concatenate([ends, amid])
@@ -334,9 +334,7 @@ def rows_apart(
             if explains[at] and mixed[at][agrees[at]].mean() < CLOSING_SCORE**2:
                 found.append((float(logs[at]), by, sides[at]))
         # Other orders of the rows are readings of the whole recording.
-        for order in orders:
-            rival = edges.of(order)
-            found.append((float(evidence(rival[None])[0][0]), 0, behind[0]))
+        found += [(log, 0, behind[0]) for log in evidence(edges.of(orders))[0].tolist()]
     log, by, side = max(found, key=lambda item: item[0])
     if not by:
         return

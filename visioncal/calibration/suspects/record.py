@@ -164,10 +164,15 @@ class Edges:
 
     def turned(self, pairs: IntArray) -> FloatArray:
         """(m, 4, 4) each view's target in the common one, by the nearest of its rivals."""
-        robot = self.record.robot[pairs][:, None]
+        placed, nearest, _ = self._nearest(pairs)
+        return np.asarray(placed[np.arange(len(pairs)), nearest])
+
+    def _nearest(self, pairs: IntArray) -> tuple[FloatArray, IntArray, FloatArray]:
+        """(..., m, r, 4, 4) targets in the common one by r rivals, the nearest, and squares."""
+        robot = self.record.robot[pairs][..., None, :, :]
         placed = invert(self.z) @ robot @ self.x @ self.record.camera
-        away = np.linalg.norm(self.squares(placed), axis=-1)
-        return np.asarray(placed[np.arange(len(pairs)), away.argmin(axis=1)])
+        squares = self.squares(placed)
+        return placed, np.linalg.norm(squares, axis=-1).argmin(axis=-1), squares
 
     def squares(self, turned: FloatArray) -> FloatArray:
         """(..., 2) squared distances and angles without unit; (..., 1) distances of places."""
@@ -177,8 +182,13 @@ class Edges:
         return np.stack([shift, rotation_angle(turned)], axis=-1) ** 2
 
     def of(self, pairs: IntArray) -> FloatArray:
-        """(m, 2) squares of a pairing, (m, 1) of places; infinite where a view has no pose."""
-        return np.where(pairs[:, None] < 0, np.inf, self.squares(self.turned(pairs)))
+        """(..., m, 2) squares of pairings (..., m), (..., m, 1) of places; infinite without a pose.
+
+        Many pairings at once take a fraction of the time of one by one.
+        """
+        _, nearest, squares = self._nearest(pairs)
+        squares = np.take_along_axis(squares, nearest[..., None, None], axis=-2)[..., 0, :]
+        return np.where(pairs[..., None] < 0, np.inf, squares)
 
 
 def evidence(squares: FloatArray) -> tuple[FloatArray, Mask]:
