@@ -453,3 +453,18 @@ def test_errors_of_an_arm_explain_what_the_cure_of_a_lens_leaves():
         found = calibrated(replace(cell, stated={name: other}), joints=False).verdict
         assert found.causes[0].kind == first
         assert "arm_errors" in {finding.kind for finding in found.findings}
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[1], slow(MOUNTS[0])])
+def test_a_camera_that_moved_twice_is_no_base_that_creeps(mount):
+    """Two steps of 1.5 mm one way follow time, too, and a creep in the fit would hide them."""
+    options = replace(FINE, mount=mount, views=24, seed=4, pixel_sigma_px=0.2)
+    shifts = (0.0, 1.5e-3, 3e-3)
+    cells = [simulate(replace(options, camera_moved_m=by_m)) for by_m in shifts]
+    corners = [cells[(at >= 9) + (at >= 17)].corners[at] for at in range(24)]
+    known = calibrated(showing(cells[0], corners), joints=False)
+    (cause, *_) = known.verdict.causes
+    assert cause.kind == "moved_at_once"
+    assert "moved at once, twice: from view 9 on, " in cause.words
+    after = next(iter(cells[-1].transforms.values()))
+    assert misfit(known.assessment.edges["cam"], after) < chi2_limit(FALSE_ALARM, 6)

@@ -31,8 +31,9 @@ from visioncal.calibration.stages.kinematics import (
     check_level_is_possible,
     with_likely_errors,
 )
+from visioncal.calibration.stages.likely_steps import CLEARLY, likely_steps
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.random_effects import random_effects
+from visioncal.calibration.stages.random_effects import KINDS, random_effects
 from visioncal.calibration.stages.refine import refine_jointly
 from visioncal.calibration.suspects.moved_views import views_apart
 from visioncal.core.choices import SolverName
@@ -49,7 +50,7 @@ from visioncal.estimation.outliers import (
     all_as_inliers,
     refine_inliers,
 )
-from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
@@ -57,8 +58,9 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
-from visioncal.estimation.steps import find_steps, joints_of
+from visioncal.estimation.steps import FRAME, find_steps, joints_of
 from visioncal.estimation.unknowns import SIZE
+from visioncal.model.effects import Creeps
 from visioncal.vision.pnp import ViewPoses
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
@@ -149,7 +151,8 @@ def _fit(
         cell_fit = _fit_with_inliers(cell_fit, observed)
     corners = cell_fit.linearised_corners
     rows = None if corners is None else cell_fit.all_rows(corners)
-    if found := random_effects(cell_fit.inlier_fit, cell_fit.arms, cell_fit.sizes, corners, rows):
+    found = random_effects(cell_fit.inlier_fit, cell_fit.arms, cell_fit.sizes, corners, rows)
+    if found := _without_stepped(found, cell_fit):
         gains = {effect.name: gain for effect, gain in found.items()}
         with_effects = replace(cell_fit, other_effects=(*others, *found), gains=gains)
         cell_fit = _fit_with_inliers(with_effects, observed)
@@ -170,6 +173,20 @@ def _fit(
             cell_fit = _converge_arms(replace(cell_fit, arms=arms))
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, cell_fit.fit))
+
+
+def _without_stepped(found: dict[Effect, float], cell_fit: CellFit) -> dict[Effect, float]:
+    """Random effects without creep where a frame that moved at once is clearly likelier."""
+    kinds = {effect: KINDS[effect.name.partition(" of ")[0]] for effect in found}
+    crept = {effect for effect, kind in kinds.items() if issubclass(kind, Creeps)}
+    if not crept:
+        return found
+    fit, offsets = cell_fit.fit, joint_offsets(cell_fit.arms)
+    (step, *_) = (*likely_steps(fit.problem, fit.solution, {}, offsets, {}), None)
+    if step is None or step.kind != FRAME:
+        return found
+    gain = step.gain - CLEARLY
+    return {effect: has for effect, has in found.items() if effect not in crept or has > gain}
 
 
 def _with_own_lens(cell_fit: CellFit, observed: Observed) -> CellFit:

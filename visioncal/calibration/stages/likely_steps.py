@@ -34,7 +34,7 @@ from visioncal.robot.errors import ArmErrors
 from visioncal.vision.board_shape import SCALE
 
 # Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
-_CLEARLY = 2.0 * float(np.log(100.0))
+CLEARLY = 2.0 * float(np.log(100.0))
 
 
 def steps_of(
@@ -131,7 +131,7 @@ def likely_steps(
         if double is not None and (drift is None or double[0].gain - 2.0 * penalty > drift.gain):
             second = replace(double[0], gain=double[0].gain - 2.0 * penalty)
             weighed = _weighed(second, *double[1:], errors)
-            if weighed.step.gain - single.step.gain > _CLEARLY:
+            if weighed.step.gain - single.step.gain > CLEARLY:
                 likely.append(weighed)
                 continue
         if drift is None or step.gain - penalty >= drift.gain:
@@ -140,7 +140,7 @@ def likely_steps(
         (one.step for one in likely if one.step.gain > one.needed), key=lambda step: -step.gain
     )
     if clear:
-        return tuple(step for step in clear if step.gain > clear[0].gain - _CLEARLY)
+        return tuple(step for step in clear if step.gain > clear[0].gain - CLEARLY)
     if drift is None or (drift.of in errors and drift.gain < errors[drift.of].gain):
         return ()
     return (drift,)
@@ -158,7 +158,7 @@ def _weighed(
     step: Step, apart: Problem, solution: Solution, errors: Mapping[str, ArmErrors]
 ) -> _Weighed:
     """A step by the fit with it: one that errors of arms explain as well is none."""
-    gain, needed = step.gain, _CLEARLY
+    gain, needed = step.gain, CLEARLY
     for robot, arm in errors.items():
         remaining = find_pose_errors(apart, solution.state, solution.noise, robot)
         gain += (remaining.gain if remaining else 0.0) - arm.gain
@@ -167,5 +167,5 @@ def _weighed(
         left = remaining if step.kind == FRAME else arm
         if left is not None and left.is_significant:
             # The kind of an arm's errors is known less well than their presence.
-            needed = 3.0 * _CLEARLY
+            needed = 3.0 * CLEARLY
     return _Weighed(replace(step, gain=gain), needed)
