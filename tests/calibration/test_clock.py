@@ -184,15 +184,30 @@ def test_times_that_are_not_those_of_the_images_are_refused(session):
 
 def test_a_stream_of_another_time_is_named(session):
     late = with_robot_stamps(session, lambda s: s + 1e6)
-    raised(DataError, r"No view lies within streams/robot.csv", calibrate, late)
-    # Whoever states about how far they are apart is told the rest.
+    shuffled = restamped(late, np.random.default_rng(3).permutation)
+    raised(DataError, r"No view lies within streams/robot.csv", calibrate, shuffled)
+    # Stated roughly, or not at all, as of a tracker and a camera that count from other days.
     clock = clocked_of(stating(late, 1.0 - 1e6)).clock
+    assert abs(clocked_of(late).clock.camera_minus_robot_s - clock.camera_minus_robot_s) < 1e-6
     # Stamps of a million seconds have digits of a tenth of a nanosecond.
     assert abs(clock.camera_minus_robot_s + 1e6 - AHEAD_S) < 1e-4
     # The first samples and frames are of 1970, as of devices that have no clock of their own.
     moved = restamped(session, lambda s: s + 1.76e9 * (s > 0.5 + AHEAD_S))
     clock = clocked_of(with_robot_stamps(moved, lambda s: s + 1.76e9 * (s > 0.5))).clock
     assert abs(clock.camera_minus_robot_s - AHEAD_S) < 1e-4
+
+
+def test_inverse_poses_are_named_where_the_clocks_stay_open(session):
+    """As of a camera's poses in its target; the turning of both is the same."""
+    inverse = []
+    for view in session.views:
+        row = pose_row(invert(view.cam_from_target().as_matrix())).values()
+        inverse.append({**view.numbers, **dict(zip(MEASURED_CAM_POSE, row, strict=True))})
+    read = with_rows(session, inverse)
+    for stamp in (lambda s: s, lambda s: s + 1e6):
+        words = "is left open by .* their inverse"
+        caught = raised(DegenerateError, words, calibrate, with_robot_stamps(read, stamp))
+        assert "--camera-inverse" in caught.next_step
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

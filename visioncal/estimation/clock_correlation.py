@@ -19,6 +19,11 @@ WIDEST_OFFSET_S = 5.0
 WINDOW_S, _STEP_S = 0.2, 0.01
 # Least distance of distinct peaks [s].
 NEAR_S = 0.1
+# Time over which angles are compared where the offset may be of any size, the step of that search
+# [s], and the least correlation of a match: chance reaches less of so many offsets.
+_FAR_WINDOW_S, _FAR_STEP_S, _FAR_CORRELATION = 1.0, 0.05, 0.8
+# Most offsets of that search, by the memory that it takes.
+_MOST_OFFSETS = 40_000
 # Fewest and most frames, or pairs of them.
 FEWEST_FRAMES, MOST_FRAMES = 4, 600
 
@@ -82,10 +87,8 @@ def turning_matches(
     common_s = min(robot.stamps_s[-1], stamps_s[-1]) - max(robot.stamps_s[0], stamps_s[0])
     count = int(min(WIDEST_OFFSET_S, 0.25 * max(float(common_s), 0.0)) / _STEP_S)
     lags_s = _STEP_S * np.arange(-count, count + 1)
-    begins, known = robot.rotations(stamps_s[first] - lags_s[:, None])
-    ends, also_known = robot.rotations(stamps_s[later] - lags_s[:, None])
-    products = np.abs(np.einsum("lpi,lpi->lp", begins, ends))
-    by_robot, inside = 2.0 * np.arccos(np.minimum(products, 1.0)), known & also_known
+    from_s, to_s = (stamps_s[rows] - lags_s[:, None] for rows in (first, later))
+    by_robot, inside = _turned(robot, from_s, to_s)
     scores = _correlations(by_robot, by_camera, inside)
     # Chance alone correlates a short overlap.
     scores[inside.sum(axis=1) <= max(0.5 * len(first), 2)] = 0.0
@@ -99,6 +102,42 @@ def turning_matches(
             offset_s += _STEP_S * (0.5 * (left - right) / curvature if curvature < 0.0 else 0.0)
         matches.append(Match(float(offset_s) + about_s, float(scores[peak]), at_end))
     return tuple(matches)
+
+
+def far_offset(robot: Trajectory, frames: ImageTimes) -> float | None:
+    """The offset [s] of clocks of any epochs at which camera and robot turn alike; None of several.
+
+    At least half of the views lie within the robot's time there.
+    """
+    stamps_s, poses = frames.stamps_s, frames.cam_from_target
+    later = np.searchsorted(stamps_s, stamps_s + _FAR_WINDOW_S)
+    first = np.flatnonzero(later < len(frames))
+    first = first[evenly(len(first), MOST_FRAMES // 3)]
+    later, steps = later[first], np.rint((stamps_s[first] - stamps_s[0]) / _FAR_STEP_S).astype(int)
+    grid_s = np.arange(robot.stamps_s[0], robot.stamps_s[-1] - _FAR_WINDOW_S, _FAR_STEP_S)
+    shifts = np.arange(-steps.max(initial=0), len(grid_s))
+    if len(first) < FEWEST_FRAMES or not 0 < len(grid_s) <= len(shifts) < _MOST_OFFSETS:
+        return None
+    by_camera = rotation_angle(invert(poses[first]) @ poses[later])
+    by_camera *= _FAR_WINDOW_S / (stamps_s[later] - stamps_s[first])
+    by_robot, is_known = _turned(robot, grid_s, grid_s + _FAR_WINDOW_S)
+    at = shifts[:, None] + steps
+    within = np.clip(at, 0, len(grid_s) - 1)
+    inside = (at == within) & is_known[within]
+    scores = _correlations(by_robot[within], by_camera, inside)
+    scores[2 * inside.sum(axis=1) < len(first)] = 0.0
+    best = int(scores.argmax())
+    others = scores[np.abs(shifts - shifts[best]) * _FAR_STEP_S > WIDEST_OFFSET_S]
+    if scores[best] < max(_FAR_CORRELATION, others.max(initial=0.0) / 0.9):
+        return None
+    return float(stamps_s[0] - robot.stamps_s[0] - _FAR_STEP_S * shifts[best])
+
+
+def _turned(robot: Trajectory, from_s: FloatArray, to_s: FloatArray) -> tuple[FloatArray, Mask]:
+    """Angles by which the robot turns between times [rad], and where both are covered."""
+    (begins, known), (ends, also_known) = robot.rotations(from_s), robot.rotations(to_s)
+    products = np.abs(np.einsum("...i,...i->...", begins, ends))
+    return 2.0 * np.arccos(np.minimum(products, 1.0)), known & also_known
 
 
 def _correlations(rows: FloatArray, values: FloatArray, inside: Mask) -> FloatArray:

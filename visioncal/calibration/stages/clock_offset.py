@@ -22,6 +22,10 @@ from visioncal.vision.pnp import ViewPoses
 LEAST_CORRELATION, LARGEST_SIGMA_S = 0.5, 0.01
 # Assumed sigma of a stated offset [s].
 STATED_SIGMA_S = 1e-3
+WITH_INVERSE = (
+    "camera and robot move alike where the target's poses are taken for the camera's in the "
+    "target, their inverse"
+)
 
 
 @dataclass(frozen=True)
@@ -185,7 +189,7 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match], span_s:
 
 
 def undetermined_error(
-    motion: RobotMotion, views: Sequence[View], resting: Mask, why: str
+    motion: RobotMotion, views: Sequence[View], resting: Mask, why: str, offset_s: float = 0.0
 ) -> DegenerateError | DataError:
     """Error where the robot's poses cannot be determined."""
     if not len(views):
@@ -196,7 +200,7 @@ def undetermined_error(
         )
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
     label, (begin_s, end_s) = f"streams/{motion.name}.csv", motion.flange.stamps_s[[0, -1]]
-    if not motion.flange.covers(stamps_s).any():
+    if not motion.flange.covers(stamps_s - offset_s).any():
         if motion.flange.step_s >= LONGEST_GAP_S:
             return too_far_apart(label, motion.flange.step_s, LONGEST_GAP_S)
         return DataError(
@@ -210,7 +214,9 @@ def undetermined_error(
         f"clock: the offset between the clocks of camera and robot is left open by {len(views)} "
         f"views, of which {int(resting.sum())} were taken at rest: {why}.",
         culprits=[label, "views.csv: stamp_s"],
-        next_step="Sweep the robot to and fro, about different axes, with the target in view, each "
+        next_step="Convert the recording again with --camera-inverse."
+        if why == WITH_INVERSE
+        else "Sweep the robot to and fro, about different axes, with the target in view, each "
         f"row's stamp_s that of its own image; or take {FEWEST_VIEWS} views or more at rest; or "
         "state [clock] camera_minus_robot_s.",
     )

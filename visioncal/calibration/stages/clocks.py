@@ -16,6 +16,7 @@ from visioncal.calibration.stages.clock_offset import (
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
     STATED_SIGMA_S,
+    WITH_INVERSE,
     ClockedViews,
     ClockPair,
     change_doubt,
@@ -31,10 +32,11 @@ from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import ClockFit, clear_fit, clock_change, fit_offset, fit_readout
-from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
+from visioncal.estimation.clock_correlation import ImageTimes, far_offset, turning_matches
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.rolling_shutter import (
     compress_delayed,
@@ -46,6 +48,7 @@ from visioncal.estimation.problem_parts import Effect
 from visioncal.results import CameraResult
 from visioncal.results.sections import ClockResult
 from visioncal.robot import Robot
+from visioncal.robot.trajectory import Trajectory
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import is_camera_observation
 from visioncal.session.motion import (
@@ -226,7 +229,11 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
     """Gives views their poses at the best available offset; `change` is what was corrected."""
     flange, stated_s, views = sweep.motion.flange, sweep.stated_s, sweep.waiting
     frames = sweep.fitted_frames(views)
-    matches = turning_matches(flange, frames, stated_s or 0.0)
+    about_s = stated_s or 0.0
+    if stated_s is None and len(frames) and not flange.covers(frames.stamps_s).any():
+        # Clocks of other epochs, as of a tracker and of a camera's driver.
+        about_s = far_offset(flange, frames) or 0.0
+    matches = turning_matches(flange, frames, about_s)
     sound = [
         match for match in matches if match.correlation >= LEAST_CORRELATION and not match.at_end
     ]
@@ -242,7 +249,7 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
                 corrected[at] = replace(view, numbers={**view.numbers, "stamp_s": stamp_s})
         return _clocked(replace(sweep, views=tuple(corrected)), change_doubt(changed, views))
     clock = ClockResult(
-        camera_minus_robot_s=stated_s or 0.0,
+        camera_minus_robot_s=about_s,
         method="rest",
         stated_s=stated_s,
         correlation=matches[0].correlation if matches else None,
@@ -264,8 +271,19 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
         doubts = (*offset_doubts(clock), *([] if change is None else [change]))
         clocked = _at_offset(sweep, clock, doubts, notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
-    span_s = float(np.ptp(flange.stamps_s))
-    return _undetermined(sweep, clock, why_undetermined(fits, matches, span_s))
+    why = why_undetermined(fits, matches, float(np.ptp(flange.stamps_s)))
+    if sound and _are_inverse(flange, frames, starts):
+        why = WITH_INVERSE
+    return _undetermined(sweep, clock, why)
+
+
+def _are_inverse(flange: Trajectory, frames: ImageTimes, starts: Sequence[float]) -> bool:
+    """Whether measured poses of the target determine the offset once they are inverted."""
+    if frames.stack is not None:
+        return False
+    inverse = replace(frames, cam_from_target=invert(frames.cam_from_target), covariance=None)
+    fit = clear_fit(fit_offset(flange, inverse, starts), None)
+    return fit is not None and fit.sigma_s <= LARGEST_SIGMA_S
 
 
 def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
@@ -288,7 +306,7 @@ def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
         clock = replace(clock, method="stated", sigma_s=STATED_SIGMA_S)
         return _at_offset(sweep, clock, (Finding("clock", words, _SHOW_OFFSET),))
     if resting.sum() < FEWEST_VIEWS:
-        raise undetermined_error(sweep.motion, views, resting, why)
+        raise undetermined_error(sweep.motion, views, resting, why, offset_s)
     moving = {view.number for view, is_still in zip(views, resting, strict=True) if not is_still}
     words = (
         f"{counted(len(moving), 'view', ('that was', 'that were'))} taken in motion "
