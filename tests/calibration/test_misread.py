@@ -389,6 +389,21 @@ def test_the_advised_command_runs_as_printed_and_mends_the_session(tmp_path, mon
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_another_sign_of_an_axis_of_the_targets_places_is_named_and_mended(
+    tmp_path, monkeypatch, mount
+):
+    """As of pictures that were turned over, or of y upwards, beside turns that are right."""
+    monkeypatch.chdir(tmp_path)
+    poses = cell_poses(mount)
+    seen = poses.camera.poses()
+    seen[:, 1, 3] *= -1.0
+    pairs_session(mount, poses.true_robot, seen).save(Path("cell"))
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert [run.status for run in followed.runs] == [3, 0]
+    assert "With another sign of y in the camera's positions" in followed.runs[0].said
+
+
 @pytest.mark.slow
 def test_positions_and_rotations_that_two_signs_may_belong_to_are_both_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

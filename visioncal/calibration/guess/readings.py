@@ -223,6 +223,8 @@ def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Cha
         yield from _units("camera", declared.camera, "the board's size in")
     else:
         yield from _changes_of_side("camera", declared.camera)
+        # As of y upwards, or of pictures that were turned over, beside rotations that are right.
+        yield from (each for each in _other_signs("camera") if each.cost == 1)
     (other,) = {*MOUNTS} - {declared.mount}
     yield Change(f"the camera mounted {other}", "chain", {"mount": other})
     for order, rows in ROW_ORDERS.items():
@@ -252,9 +254,14 @@ def _axes() -> Iterator[Change]:
     for axes, named, cost in _orders():
         words = f"the numbers of the robot's positions taken as {named}"
         yield Change(words, "robot", {"axes": axes}, cost)
+    yield from _other_signs("robot")
+
+
+def _other_signs(part: Literal["robot", "camera"]) -> Iterator[Change]:
+    """Positions of which some axes have another sign."""
     for signs, named, cost in _signs("xyz"):
-        words = f"another sign of {named} in the robot's positions"
-        yield Change(words, "robot", {"signs": signs}, cost)
+        words = f"another sign of {named} in the {part}'s positions"
+        yield Change(words, part, {"signs": signs}, cost)
 
 
 def _components(form: str) -> Iterator[Change]:
