@@ -97,6 +97,27 @@ def test_steep_views_keep_their_corners():
     assert ours[0] >= 20
 
 
+def test_small_markers_are_read_in_a_larger_copy(charuco):
+    cell, images = charuco
+    target, counts = cell.options.target, []
+    for image in images:
+        # Squares of some 15 px, with markers whose modules have two.
+        side = np.median(np.linalg.norm(np.diff(find_target(image, target).px, axis=0), axis=1))
+        by = 15.0 / side
+        small = cv2.resize(image, None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
+        seen, whole = find_target(small, target), find_target(image, target)
+        plain = kind_of(target).search(small, target)
+        counts.append([0 if isinstance(at, NotFound) else len(at.ids) for at in (plain, seen)])
+        ids, at, of = np.intersect1d(seen.ids, whole.ids, return_indices=True)
+        away = seen.px[at] - ((whole.px[of] + 0.5) * by - 0.5)
+        assert len(ids) >= 20
+        # Corners of squares of 15 px are found to a twentieth of a pixel, and none is another.
+        assert np.abs(away).max() < 0.5
+        assert np.sqrt(np.mean(away**2)) < 0.05
+    # As they are, fewer than two thirds of these are read.
+    assert all(plain < seen / 1.5 for plain, seen in counts)
+
+
 def test_a_board_that_the_image_cuts_needs_no_thorough_search(charuco, monkeypatch):
     cell, images = charuco
     target, searches = cell.options.target, []

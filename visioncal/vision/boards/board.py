@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import FloatArray, Image, IntArray, Target
-from visioncal.vision.boards.imaging import blur_at_corners, shrunk
+from visioncal.vision.boards.imaging import blur_at_corners, resized, shrunk
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.prints import Print
 from visioncal.vision.boards.template import Refined, refine
@@ -19,6 +19,9 @@ from visioncal.vision.poses import FEWEST_CORNERS
 # too few fit, all corners of the detector are used, with a tenth of the weight: their accuracy
 # relative to the template's in the median.
 DETECTED_WEIGHT = 0.1
+# Squares up to this side may have markers that are read in a larger copy alone: of three pixels a
+# module and less [px].
+_SMALL_PX = 30.0
 # From a corner through the squares around it [sides].
 _DIAGONALS = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
 
@@ -31,6 +34,8 @@ class Board(BoardKind):
     long_side_px: ClassVar[int] = 2000
     # Whether there is a search that takes a third of the time and detects less.
     has_quick_search: ClassVar[bool] = False
+    # Whether corners are found beside markers that are read.
+    has_markers: ClassVar[bool] = False
 
     @abstractmethod
     def search(
@@ -65,7 +70,31 @@ class Board(BoardKind):
                 if refined.weights is None:
                     return refined
         seen = self.search(image, target)
+        if self.has_markers and sides[0] <= self.long_side_px and sides[1] > 1:
+            seen = self._larger(image, target, seen)
         return seen if isinstance(seen, NotFound) else self._refined(image, target, seen)
+
+    def _larger(
+        self, image: Image, target: Target, seen: DetectedCorners | NotFound
+    ) -> DetectedCorners | NotFound:
+        """Corners of an enlarged image, where these are more than were seen of a small board.
+
+        Most markers with modules of two pixels are read so, and fewer than half as they are.
+        """
+        count = 0
+        if isinstance(seen, DetectedCorners):
+            count = len(seen.ids)
+            away = np.linalg.norm(seen.px[:, None] - seen.px, axis=2) + np.diag([np.inf] * count)
+            is_large = count > 1 and np.median(away.min(axis=1)) > _SMALL_PX
+            if is_large or self._is_all(image, target, seen):
+                return seen
+        elif seen.misfit:
+            return seen
+        by = min(3.0, 2.0 * self.long_side_px / max(image.shape))
+        larger = self.search(resized(image, by), target)
+        if isinstance(larger, NotFound) or len(larger.ids) <= count:
+            return seen
+        return DetectedCorners(larger.ids, (larger.px + 0.5) / by - 0.5)
 
     def _is_all(self, image: Image, target: Target, seen: DetectedCorners) -> bool:
         """Whether these are all corners that the (h, w) image shows, of a board that it may cut."""
