@@ -587,7 +587,7 @@ def cell(tmp_path_factory):
 # Of what recover.json holds, and what is said of it; a text that is no act at all.
 EDITED_ACTS = (
     ({"minutes": "x"}, "but must be a table"), ({"minutes": {"plan": np.nan}}, "minutes.plan"),
-    ({"minutes": {"plan": "1"}}, "must be a number"), ({"stated": None}, "stated is None"),
+    ({"minutes": {"plan": "1"}}, "must be a number"), ({"stated": None}, "stated is null"),
     ({"stated": "camera"}, "must be a list"), ({"against": 3}, "against is 3"),
     ({"record": "visioncal record; rm -rf x"}, "must be a visioncal record"),
     ({"record": "rm -rf x"}, "must be a visioncal record"), ({"schema": 9}, "schema is 9"),

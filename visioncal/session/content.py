@@ -259,7 +259,8 @@ class SessionContent:
     @cached_property
     def plates(self) -> Mapping[str, Target]:
         """Targets by their names in session.toml, also for the only one."""
-        names = list(self.declaration.named("target"))
+        # A session that was built without a document's table has its only one without a name.
+        names = [*self.declaration.named("target")] or [*self.boards]
         return dict(zip(names, self.boards.values(), strict=False))
 
     @property
