@@ -408,6 +408,7 @@ def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
     ):
         visioncal(*placing, source, "-o", measured_cloud).refused(why)
     assert measured_cloud.read_bytes() == by_others
+    visioncal(*placing, tmp_path / "none.npy", "-o", in_base).refused("none.npy does not exist")
     again_there = read_cloud(in_base.read_bytes(), "base.ply")
     # Floats of the file.
     assert again_there == pytest.approx(points[np.isfinite(points[:, 2])], abs=1e-6)

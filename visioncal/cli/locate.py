@@ -185,6 +185,7 @@ def _write_cloud(
             culprits=["--output"],
             next_step="Add -o cloud.ply.",
         )
+    points = read_cloud(read_bytes(cloud, MOST_IMAGE_BYTES), cloud.name)
     if output.exists() and output.samefile(cloud):
         raise DataError(
             f"-o {output} is the cloud of --cloud itself, which is kept as it was measured.",
@@ -194,7 +195,6 @@ def _write_cloud(
     is_ply = output.suffix.lower() == ".ply"
     if is_ply:
         check_own(output)
-    points = read_cloud(read_bytes(cloud, MOST_IMAGE_BYTES), cloud.name)
     placed = cloud_in_base(calibration, points, flange, joints_rad=joints_rad)
     write_atomically(output, (ply_of if is_ply else npy_of)(placed))
     say(f"wrote {output}: {np.isfinite(placed[..., 2]).sum()} points in the base, in metres")

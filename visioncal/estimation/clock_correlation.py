@@ -110,13 +110,16 @@ def far_offset(robot: Trajectory, frames: ImageTimes) -> float | None:
     At least half of the views lie within the robot's time there.
     """
     stamps_s, poses = frames.stamps_s, frames.cam_from_target
+    # A stamp of another epoch among the others spans more.
+    if np.ptp(robot.stamps_s) + np.ptp(stamps_s) > _FAR_STEP_S * _MOST_OFFSETS:
+        return None
     later = np.searchsorted(stamps_s, stamps_s + _FAR_WINDOW_S)
     first = np.flatnonzero(later < len(frames))
     first = first[evenly(len(first), MOST_FRAMES // 3)]
     later, steps = later[first], np.rint((stamps_s[first] - stamps_s[0]) / _FAR_STEP_S).astype(int)
     grid_s = np.arange(robot.stamps_s[0], robot.stamps_s[-1] - _FAR_WINDOW_S, _FAR_STEP_S)
     shifts = np.arange(-steps.max(initial=0), len(grid_s))
-    if len(first) < FEWEST_FRAMES or not 0 < len(grid_s) <= len(shifts) < _MOST_OFFSETS:
+    if len(first) < FEWEST_FRAMES or not 0 < len(grid_s) <= len(shifts):
         return None
     by_camera = rotation_angle(invert(poses[first]) @ poses[later])
     by_camera *= _FAR_WINDOW_S / (stamps_s[later] - stamps_s[first])

@@ -85,7 +85,10 @@ class Check:
     depth: tuple[Finding, ...] = ()  # Whether depth still is what it was, where there is some.
 
     def __repr__(self) -> str:
-        changed = listed([change.name for change in self.named] or ["nothing"], "or")
+        names = [change.name for change in self.named]
+        names += ["the reading of poses"] * (self.misread is not None)
+        names += ["depth"] * any(found.kind == DEPTH_CHANGED for found in self.depth)
+        changed = listed(names or ["nothing" if self.passed else "unknown"], "or")
         facts = {"stops": f"{self.predicted.stops}", "may have changed": changed}
         facts["as large a misfit by chance"] = figure(self.p_value)
         holds = "holds" if self.passed else "does not hold"

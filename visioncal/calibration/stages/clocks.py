@@ -249,7 +249,7 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
                 corrected[at] = replace(view, numbers={**view.numbers, "stamp_s": stamp_s})
         return _clocked(replace(sweep, views=tuple(corrected)), change_doubt(changed, views))
     clock = ClockResult(
-        camera_minus_robot_s=about_s,
+        camera_minus_robot_s=stated_s or 0.0,
         method="rest",
         stated_s=stated_s,
         correlation=matches[0].correlation if matches else None,
@@ -273,7 +273,7 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
     why = why_undetermined(fits, matches, float(np.ptp(flange.stamps_s)))
     if sound and _are_inverse(flange, frames, starts):
-        why = WITH_INVERSE
+        why, clock = WITH_INVERSE, replace(clock, camera_minus_robot_s=about_s)
     return _undetermined(sweep, clock, why)
 
 

@@ -63,6 +63,8 @@ def _taken_as_exact(run: RunState, camera: str) -> Iterator[Finding]:
     fitted, lens = run.assessment.fit, (unknowns.LENS, camera)
     scene = fitted.camera_parameters.problems[camera].scene
     is_exact = not scene.estimated and scene.matrix_sigma_px is None
+    # Beside a step the derivative is another.
+    is_exact &= run.assessment.went is run.assessment.cell_fit
     if not is_exact or len(fitted.unknowns.columns(lens)) or camera not in fitted.frames:
         return
     by_px = run.cell_fit.lens_changes[camera] / fitted.camera(camera).matrix[0]

@@ -66,9 +66,11 @@ def _found(run: RunState) -> Iterator[Finding]:
         DRIFT: ("moved_slowly", "Fasten base and target, let the arm warm up, and record again."),
     }[step.kind]
     is_drift = step.kind == DRIFT
+    # Closed forms take no step.
+    is_applied = step.kind == FRAME and run.assessment.went is not run.assessment.cell_fit
     yield Finding(
         kind,
-        f"{_words(step, run)}{last if step.kind == FRAME else between}",
+        f"{_words(step, run)}{last if is_applied else between}",
         Remedy(do)
         if is_drift
         else _of_tool(run, step, do) or cell.or_separately(do, step.stop, note),

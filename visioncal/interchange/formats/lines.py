@@ -41,7 +41,7 @@ _MOVED = re.compile(rf"\bmove[jlpc]\s*\(\s*(?:get_inverse_kin\s*\(\s*)?({_LITERA
 _PARTS = ("x", "y", "z", "w")
 # A list within a line of text, and one behind the count of its numbers, as `Q[6]{..}` of RobWork.
 _INNER = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
-_REMARK = re.compile(r"\s*(?:\[[^\]]*\]|\([^)]*\))(?=.*:\s*$)")
+_REMARK = re.compile(r"\s*(?:\[[^\]]*\]|\([^)]*\))")
 COUNTED = re.compile(r"\s*\w*\[[0-9]+\]\s*\{")
 # Lines with their places.
 _Lines: TypeAlias = Sequence[tuple[str, str]]
@@ -147,7 +147,10 @@ def blocks_of(lines: _Lines, path: Path) -> Fields | None:
     """Rows of several lines each, of a picture or below a line of words; None where none are."""
     rows = list[tuple[str, dict[str, object], dict[str, FloatArray]]]()
     # Counts and remarks in brackets are no part of a heading: `matrix wMe[0] (size 4x4):`.
-    lines = [(place, _REMARK.sub("", line)) for place, line in lines]
+    lines = [
+        (place, _REMARK.sub("", line) if line.rstrip().endswith(":") else line)
+        for place, line in lines
+    ]
     for stop in _stops(closed(lines)):
         arrays = arrays_in(stop)
         title = next((line for _, line in reversed(stop) if not _numbers_in(line)[1]), "")

@@ -343,7 +343,8 @@ def _apart(groups: Mapping[str, dict[str, str]]) -> dict[str, dict[str, str]]:
         whole = {letters: each for letters, each in joined.items() if len(each) == 7}
         names = {name for each in whole.values() for name in each.values()}
         found[prefix] = {last: name for last, name in named.items() if name not in names}
-        found |= {f"{prefix}{letters}_": each for letters, each in whole.items()}
+        # A t alone stands for a translation, whose rotation is another group's.
+        found |= {f"{prefix}{of.replace('t', 'tt')}_": each for of, each in whole.items()}
     return found
 
 
