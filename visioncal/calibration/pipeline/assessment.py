@@ -128,10 +128,25 @@ class FitAssessment:
         """The fit beside boards of any size, where it holds sizes: causes are judged by it."""
         return with_free_sizes(self.fit)
 
+    @property
+    def is_stepped(self) -> bool:
+        """Whether the result is that after a step."""
+        return self.went is not self.cell_fit
+
+    @property
+    def fit_of_noise(self) -> Fit:
+        """The fit that residuals and noise are of."""
+        return self.went.fit if self.is_stepped else self.fit
+
+    @cached_property
+    def sized_of_noise(self) -> Fit:
+        """The same beside boards of any size."""
+        return with_free_sizes(self.went.fit) if self.is_stepped else self.sized
+
     @cached_property
     def intervals(self) -> FloatArray:
         """(r, 2, 2) 95 % intervals of the robots' noise; see `estimation.intervals`."""
-        fit = self.went.fit if self.went is not self.cell_fit else self.fit
+        fit = self.fit_of_noise
         return noise_intervals(fit.problem, fit.state, fit.noise)
 
     @property

@@ -10,7 +10,6 @@ from visioncal.calibration.pipeline.budget import middle_jacobians, middles_of
 from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.likely_steps import with_free_sizes
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
@@ -302,8 +301,8 @@ def _arms(run: RunState) -> list[JudgedArm]:
         if not problem.is_combined and problem.observations.covariance.any():
             noise, (least_rad, least_m) = answer.sigmas[robot], intervals[:, 0].tolist()
             # A board whose size is held leaves residuals that no flange has.
-            went = answer.went.fit
-            pair = (at.noise.robots[index] for at in (with_free_sizes(went), went))
+            fits = (answer.sized_of_noise, answer.fit_of_noise)
+            pair = (fit.noise.robots[index] for fit in fits)
             share_rad, share_m = np.minimum(np.divide(*pair), 1.0).tolist()
             judged = replace(
                 judged,

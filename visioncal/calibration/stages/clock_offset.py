@@ -22,9 +22,16 @@ from visioncal.vision.pnp import ViewPoses
 LEAST_CORRELATION, LARGEST_SIGMA_S = 0.5, 0.01
 # Assumed sigma of a stated offset [s].
 STATED_SIGMA_S = 1e-3
+# Why an offset is left open, and what to do.
 WITH_INVERSE = (
     "camera and robot move alike where the target's poses are taken for the camera's in the "
-    "target, their inverse"
+    "target, their inverse",
+    "Convert the recording again with --camera-inverse.",
+)
+SWEEP = (
+    "Sweep the robot to and fro, about different axes, with the target in view, each row's stamp_s "
+    f"that of its own image; or take {FEWEST_VIEWS} views or more at rest; or state [clock] "
+    "camera_minus_robot_s."
 )
 
 
@@ -189,9 +196,9 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match], span_s:
 
 
 def undetermined_error(
-    motion: RobotMotion, views: Sequence[View], resting: Mask, why: str, offset_s: float = 0.0
+    motion: RobotMotion, views: Sequence[View], resting: Mask, offset_s: float, why: str, step: str
 ) -> DegenerateError | DataError:
-    """Error where the robot's poses cannot be determined."""
+    """Error where the robot's poses cannot be determined at an offset, by reason and next step."""
     if not len(views):
         return DataError(
             "No view has both a time and a pose of the target.",
@@ -214,9 +221,5 @@ def undetermined_error(
         f"clock: the offset between the clocks of camera and robot is left open by {len(views)} "
         f"views, of which {int(resting.sum())} were taken at rest: {why}.",
         culprits=[label, "views.csv: stamp_s"],
-        next_step="Convert the recording again with --camera-inverse."
-        if why == WITH_INVERSE
-        else "Sweep the robot to and fro, about different axes, with the target in view, each "
-        f"row's stamp_s that of its own image; or take {FEWEST_VIEWS} views or more at rest; or "
-        "state [clock] camera_minus_robot_s.",
+        next_step=step,
     )

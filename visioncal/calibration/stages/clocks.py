@@ -16,6 +16,7 @@ from visioncal.calibration.stages.clock_offset import (
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
     STATED_SIGMA_S,
+    SWEEP,
     WITH_INVERSE,
     ClockedViews,
     ClockPair,
@@ -271,10 +272,11 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
         doubts = (*offset_doubts(clock), *([] if change is None else [change]))
         clocked = _at_offset(sweep, clock, doubts, notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
-    why = why_undetermined(fits, matches, float(np.ptp(flange.stamps_s)))
     if sound and _are_inverse(flange, frames, starts):
-        why, clock = WITH_INVERSE, replace(clock, camera_minus_robot_s=about_s)
-    return _undetermined(sweep, clock, why)
+        clock = replace(clock, camera_minus_robot_s=about_s)
+        return _undetermined(sweep, clock, *WITH_INVERSE)
+    span_s = float(np.ptp(flange.stamps_s))
+    return _undetermined(sweep, clock, why_undetermined(fits, matches, span_s), SWEEP)
 
 
 def _are_inverse(flange: Trajectory, frames: ImageTimes, starts: Sequence[float]) -> bool:
@@ -286,7 +288,7 @@ def _are_inverse(flange: Trajectory, frames: ImageTimes, starts: Sequence[float]
     return fit is not None and fit.sigma_s <= LARGEST_SIGMA_S
 
 
-def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
+def _undetermined(sweep: _Sweep, clock: ClockResult, why: str, step: str) -> ClockedViews:
     """Gives views their poses without an estimate: at the stated offset, or for views at rest."""
     views, offset_s = sweep.waiting, clock.camera_minus_robot_s
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
@@ -306,7 +308,7 @@ def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
         clock = replace(clock, method="stated", sigma_s=STATED_SIGMA_S)
         return _at_offset(sweep, clock, (Finding("clock", words, _SHOW_OFFSET),))
     if resting.sum() < FEWEST_VIEWS:
-        raise undetermined_error(sweep.motion, views, resting, why, offset_s)
+        raise undetermined_error(sweep.motion, views, resting, offset_s, why, step)
     moving = {view.number for view, is_still in zip(views, resting, strict=True) if not is_still}
     words = (
         f"{counted(len(moving), 'view', ('that was', 'that were'))} taken in motion "

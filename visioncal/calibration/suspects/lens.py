@@ -63,9 +63,13 @@ def _taken_as_exact(run: RunState, camera: str) -> Iterator[Finding]:
     fitted, lens = run.assessment.fit, (unknowns.LENS, camera)
     scene = fitted.camera_parameters.problems[camera].scene
     is_exact = not scene.estimated and scene.matrix_sigma_px is None
-    # Beside a step the derivative is another.
-    is_exact &= run.assessment.went is run.assessment.cell_fit
-    if not is_exact or len(fitted.unknowns.columns(lens)) or camera not in fitted.frames:
+    # After a step the derivative is another.
+    if (
+        run.assessment.is_stepped
+        or not is_exact
+        or len(fitted.unknowns.columns(lens))
+        or camera not in fitted.frames
+    ):
         return
     by_px = run.cell_fit.lens_changes[camera] / fitted.camera(camera).matrix[0]
     moves = fitted.response(Effect.free("a given lens", by_sensor=by_px))

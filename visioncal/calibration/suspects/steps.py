@@ -67,7 +67,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     }[step.kind]
     is_drift = step.kind == DRIFT
     # Closed forms take no step.
-    is_applied = step.kind == FRAME and run.assessment.went is not run.assessment.cell_fit
+    is_applied = step.kind == FRAME and run.assessment.is_stepped
     yield Finding(
         kind,
         f"{_words(step, run)}{last if is_applied else between}",

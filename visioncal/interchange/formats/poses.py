@@ -344,7 +344,7 @@ def _apart(groups: Mapping[str, dict[str, str]]) -> dict[str, dict[str, str]]:
         names = {name for each in whole.values() for name in each.values()}
         found[prefix] = {last: name for last, name in named.items() if name not in names}
         # A t alone stands for a translation, whose rotation is another group's.
-        found |= {f"{prefix}{of.replace('t', 'tt')}_": each for of, each in whole.items()}
+        found |= {f"{prefix}{'tt' if of == 't' else of}_": each for of, each in whole.items()}
     return found
 
 

@@ -34,8 +34,8 @@ class Board(BoardKind):
     long_side_px: ClassVar[int] = 2000
     # Whether there is a search that takes a third of the time and detects less.
     has_quick_search: ClassVar[bool] = False
-    # Whether corners are found beside markers that are read.
-    has_markers: ClassVar[bool] = False
+    # Whether a small board is searched in an enlarged image, too, since its markers have to be read.
+    is_enlarged: ClassVar[bool] = False
 
     @abstractmethod
     def search(
@@ -70,7 +70,7 @@ class Board(BoardKind):
                 if refined.weights is None:
                     return refined
         seen = self.search(image, target)
-        if self.has_markers and sides[0] <= self.long_side_px and sides[1] > 1:
+        if self.is_enlarged and sides[0] <= self.long_side_px and sides[1] > 1:
             seen = self._larger(image, target, seen)
         return seen if isinstance(seen, NotFound) else self._refined(image, target, seen)
 

@@ -44,7 +44,7 @@ class Charuco(Board):
         "(?P<legacy>_legacy)?"
     )
     keys = "columns rows square_m square_sigma_m marker_m dictionary legacy"
-    is_seen_in_part = is_dense = has_quick_search = has_markers = True
+    is_seen_in_part = is_dense = has_quick_search = is_enlarged = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy, first_id."""
