@@ -1752,14 +1752,14 @@ def test_axis_times_angle_is_a_rotation_and_acceleration_is_none(tmp_path, monke
     assert possible_poses(fields, by_shape=False) == []
 
 
-@pytest.mark.parametrize("letter", ["m", "t"])
-def test_columns_joined_to_a_letter_are_a_pose_of_their_own(tmp_path, monkeypatch, letter):
+@pytest.mark.parametrize("letters", ["m", "t", "target"])
+def test_columns_joined_to_letters_are_a_pose_of_their_own(tmp_path, monkeypatch, letters):
     """As `mx .. mqw` of a marker beside the plain names of the robot's pose."""
     monkeypatch.chdir(tmp_path)
     sides, mount = pairs()
     names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     rows = np.array([[*seven(a), *seven(b)] for a, b in zip(*sides, strict=True)])
-    write_table(tmp_path / "log.csv", [*names, *(letter + name for name in names)], rows)
+    write_table(tmp_path / "log.csv", [*names, *(letters + name for name in names)], rows)
     follow("convert", "log.csv", "out", "--mount", mount).last.good()
     np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), sides, atol=1e-9)
 

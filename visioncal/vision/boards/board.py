@@ -34,7 +34,7 @@ class Board(BoardKind):
     long_side_px: ClassVar[int] = 2000
     # Whether there is a search that takes a third of the time and detects less.
     has_quick_search: ClassVar[bool] = False
-    # Whether a small board is searched in an enlarged image, too, since its markers have to be read.
+    # Whether a small board is searched in an enlarged image, too, as its markers have to be read.
     is_enlarged: ClassVar[bool] = False
 
     @abstractmethod
